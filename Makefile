@@ -1,0 +1,57 @@
+# The Python that .venv is made from (3.11 or 3.12), and what pytest is given.
+PYTHON ?= python3
+PYTEST_ARGS ?= -n 2
+CONFIG ?= configs/point_maze.yaml
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
+PINS := pyproject.toml constraints.txt
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.NOTPARALLEL:
+.PHONY: help quickstart test lint format docs clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+quickstart: $(VENV)/.run ## install into .venv and train on the Point Maze (CONFIG=configs/...)
+	@dir=runs/quickstart; n=2; \
+	while [ -e "$$dir" ] && [ -n "$$(ls -A "$$dir")" ]; do dir=runs/quickstart-$$n; n=$$((n + 1)); done; \
+	set -x; $(BIN)/star train $(CONFIG) --run-dir "$$dir"
+
+test: lint ## lint, check the types, run the tests (PYTEST_ARGS="-n 2")
+	$(BIN)/python -m mypy star envs
+	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
+
+lint: $(VENV)/.test ## ruff: rules and formatting
+	$(BIN)/python -m ruff check
+	$(BIN)/python -m ruff format --check
+
+format: $(VENV)/.test ## ruff: repair and format
+	$(BIN)/python -m ruff check --fix
+	$(BIN)/python -m ruff format
+
+docs: $(VENV)/.docs ## build the documentation into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+clean: ## remove .venv, caches and built files; runs/ stays
+	rm -rf $(VENV) .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist site
+	find star envs tests scripts -name __pycache__ -type d -exec rm -rf {} + 2>/dev/null || true
+
+# One stamp for each set of packages: nothing is installed again unless the pins change.
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12) and \
+	  "star-rl needs Python 3.11 or 3.12, not %d.%d; try: make PYTHON=python3.12 ..." % sys.version_info[:2])'
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.run: $(PINS) | $(BIN)/python
+	@echo "installing into $(VENV) (a minute or two)"
+	$(INSTALL) .
+	@touch $@
+
+$(VENV)/.test $(VENV)/.docs: $(VENV)/.%: $(PINS) | $(BIN)/python
+	@echo "installing into $(VENV) (a minute or two)"
+	$(INSTALL) '.[$*]'
+	@touch $@ $(VENV)/.run

@@ -1,0 +1,30 @@
+"""One flat batch axis, however many vmaps surround a function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+
+
+def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of pytrees with a leading batch axis [n, ...], made to see a single such axis under any vmaps.
+
+    A vmap over S calls it once with [S * n, ...], arguments that are not batched repeated, and returns [S, n, ...].
+    """
+    inner = custom_vmap(function)
+
+    @inner.def_vmap
+    def rule(axis_size: int, in_batched: Any, *args: Any) -> tuple[Any, Any]:
+        def flatten(leaf: jax.Array, batched: bool) -> jax.Array:
+            whole = leaf if batched else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
+            return whole.reshape(-1, *whole.shape[2:])
+
+        out = inner(*jax.tree.map(flatten, args, tuple(in_batched)))
+        out = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), out)
+        return out, jax.tree.map(lambda _: True, out)
+
+    return inner

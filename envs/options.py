@@ -1,0 +1,62 @@
+"""Options of the tasks: what each may be, and the one error that says what was wrong."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+
+class EnvError(ValueError):
+    """A task, engine or option that cannot be had. The message is one line: key, value, what is allowed."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option's default, the test of a value, and the words for what passes it."""
+
+    default: Any
+    accepts: Callable[[Any], bool]
+    allowed: str
+
+
+def choice(default: str, *others: str) -> Option:
+    """One of a few words."""
+    words = (default, *others)
+    return Option(default, lambda value: isinstance(value, str) and value in words, ", ".join(words))
+
+
+def count(default: int | None) -> Option:
+    """A positive whole number."""
+    return Option(default, lambda value: type(value) is int and value > 0, "a whole number above 0")
+
+
+def duration(default: float | None) -> Option:
+    """A positive, finite number of seconds."""
+    return Option(
+        default,
+        lambda value: type(value) in (int, float) and 0 < value < float("inf"),
+        "a number of seconds above 0",
+    )
+
+
+def resolve(task: str, options: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The value of every option: as given, else its default.
+
+    Raises:
+      EnvError: if a name is unknown or a value is not allowed.
+    """
+    for key, value in given.items():
+        if key not in options:
+            raise EnvError(f'option "{key}" ({value!r}) is not one of {task}: {known(key, options)}')
+        if not options[key].accepts(value):
+            raise EnvError(f'option "{key}" of {task} is {value!r}; allowed: {options[key].allowed}')
+    return {key: given.get(key, option.default) for key, option in options.items()}
+
+
+def known(word: str, words: Iterable[str]) -> str:
+    """The allowed words, with the one nearest to `word` if any is near."""
+    words = tuple(words)
+    nearest = difflib.get_close_matches(str(word), words, n=1)
+    return "allowed: " + ", ".join(words) + (f'; did you mean "{nearest[0]}"?' if nearest else "")

@@ -1,0 +1,188 @@
+"""Rigid-body physics behind one interface, by three engines.
+
+    native   MuJoCo in C on a thread pool, through a host callback; bit-reproducible
+    jax      MJX; any accelerator, bit-reproducible
+    warp     MJX-Warp; NVIDIA GPUs, by far the fastest there, not bit-reproducible
+
+Between env steps only position, velocity and the solver's warm start are kept: a step first derives everything else
+from them, so that a reset is complete once these are replaced. Every engine steps a flat batch; vmaps are flattened
+into it (`batching.flattened`).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from mujoco import mjx, rollout
+
+from envs.batching import flattened
+from envs.options import EnvError, known
+
+CONTACTS = 24  # per environment; MJX-Warp pools them over the batch
+CONSTRAINT_ROWS = 96  # per environment, MJX-Warp
+OVERFLOW_BITS = 0b111111  # buffers of MJX-Warp that were too small: constraint rows, contacts, convex collisions
+
+INTEGRATORS = {
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
+
+
+@struct.dataclass
+class PhysicsState:
+    """All that one simulation carries from step to step.
+
+    qpos [nq] and qvel [nv] are MuJoCo's. `warmstart` [nv] is the acceleration the solver starts from; native MuJoCo
+    keeps it at 0 and warms up within an env step. `overflow` [] is 1.0 if contacts were dropped in the last step
+    because MJX-Warp's buffers were full, else 0.0.
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    warmstart: jax.Array
+    overflow: jax.Array
+
+
+StepBatch = Callable[[PhysicsState, jax.Array], PhysicsState]
+
+
+class Physics:
+    """A model and the engine that steps it, `frames` time steps to an env step.
+
+    `init` and `step` are pure functions of one simulation, for jit, scan and vmap.
+    """
+
+    def __init__(self, model: mujoco.MjModel, *, engine: str, frames: int):
+        """`engine` is a name that `resolve_engine` returns."""
+        self.model = model
+        self.engine = engine
+        self.dt = frames * model.opt.timestep
+        self._step = flattened(_ENGINES[engine](model, frames))
+
+    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
+        """A simulation at rest in every respect but position [nq] and velocity [nv]."""
+        return PhysicsState(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(qvel), overflow=jnp.zeros(()))
+
+    def step(self, data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+        """`dt` seconds under constant controls [nu]. A simulation that diverges turns non-finite, and remains so."""
+        batch = self._step(*jax.tree.map(lambda leaf: leaf[None], (data, ctrl)))
+        return jax.tree.map(lambda leaf: leaf[0], batch)
+
+
+def engines() -> tuple[str, ...]:
+    """The names that `resolve_engine` knows."""
+    return ("auto", *_ENGINES)
+
+
+def resolve_engine(engine: str) -> str:
+    """The engine to use on this machine: for `auto` the fastest, else `engine` itself.
+
+    Raises:
+      EnvError: if the name is unknown, or the package or device it needs is missing.
+    """
+    if engine not in engines():
+        raise EnvError(f'engine "{engine}" is unknown; {known(engine, engines())}')
+    nvidia, warp = _has_nvidia_gpu(), importlib.util.find_spec("warp") is not None
+    if engine == "warp" and not (nvidia and warp):
+        lacking = [need for need, met in (("an NVIDIA GPU", nvidia), ('pip install "star-rl[warp]"', warp)) if not met]
+        raise EnvError(f'engine "warp" needs {" and ".join(lacking)}; here choose native, jax or auto')
+    if engine != "auto":
+        return engine
+    if jax.default_backend() == "cpu":
+        return "native"
+    return "warp" if nvidia and warp else "jax"
+
+
+def _has_nvidia_gpu() -> bool:
+    return jax.default_backend() == "gpu" and "cuda" in jax.devices()[0].client.platform_version.lower()
+
+
+def _native(model: mujoco.MjModel, frames: int) -> StepBatch:
+    """MuJoCo in C: `mujoco.rollout` over all cores this process may use, called from the device program."""
+    threads = [mujoco.MjData(model) for _ in range(len(os.sched_getaffinity(0)))]
+    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    duration = frames * model.opt.timestep
+
+    def advance(qpos: Any, qvel: Any, ctrl: Any) -> tuple[np.ndarray, np.ndarray]:
+        state = np.zeros((len(qpos), size))
+        state[:, 1 : 1 + model.nq] = qpos
+        state[:, 1 + model.nq : 1 + model.nq + model.nv] = qvel
+        broken = ~np.isfinite(state).all(axis=1)
+        state[broken, 1 : 1 + model.nq] = model.qpos0  # MuJoCo would log a warning for each of them
+        state[broken, 1 + model.nq :] = 0
+        controls = np.repeat(np.nan_to_num(np.asarray(ctrl, np.float64))[:, None], frames, axis=1)
+        with _POOL:
+            states, _ = rollout.rollout(model, threads, state, controls, persistent_pool=True)
+        state = states[:, -1].astype(np.float32)
+        # A rollout that MuJoCo finds unstable is cut short, which shows in its clock.
+        state[broken | (states[:, -1, 0] < duration - model.opt.timestep / 2)] = np.nan
+        return state[:, 1 : 1 + model.nq], state[:, 1 + model.nq : 1 + model.nq + model.nv]
+
+    def step(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+        shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in (data.qpos, data.qvel))
+        qpos, qvel = jax.pure_callback(advance, shapes, data.qpos, data.qvel, ctrl)
+        return PhysicsState(qpos, qvel, data.warmstart, data.overflow)
+
+    return step
+
+
+_POOL = threading.Lock()  # the pool of mujoco.rollout is one for the process, and runs one rollout at a time
+
+
+def _jax(model: mujoco.MjModel, frames: int) -> StepBatch:
+    """MJX in JAX, whose contact buffers cannot be too small."""
+    device_model = mjx.put_model(model, impl="jax")
+    blank = mjx.make_data(model, impl="jax")
+
+    def step(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+        return _mjx_step(device_model, blank, frames, lambda _: jnp.zeros(()), data, ctrl)
+
+    return step
+
+
+def _warp(model: mujoco.MjModel, frames: int) -> StepBatch:
+    """MJX-Warp. Its contact buffer is shared by the batch, so blank data is made for each batch size."""
+    device_model = mjx.put_model(model, impl="warp").tree_replace({"opt._impl.warn_overflow": 0})
+
+    def overflow(full: mjx.Data) -> jax.Array:
+        return ((full._impl.overflow & OVERFLOW_BITS) != 0).astype(jnp.float32)
+
+    def step(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+        blank = mjx.make_data(model, impl="warp", naconmax=len(ctrl) * CONTACTS, njmax=CONSTRAINT_ROWS)
+        return _mjx_step(device_model, blank, frames, overflow, data, ctrl)
+
+    return step
+
+
+def _mjx_step(
+    model: mjx.Model,
+    blank: mjx.Data,
+    frames: int,
+    overflow: Callable[[mjx.Data], jax.Array],
+    data: PhysicsState,
+    ctrl: jax.Array,
+) -> PhysicsState:
+    """Step the batch [n], each simulation starting from `blank`; `overflow` reads the flag off the last frame."""
+
+    def simulate(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
+        full = blank.replace(qpos=data.qpos, qvel=data.qvel, qacc_warmstart=data.warmstart, ctrl=ctrl)
+        full = jax.lax.fori_loop(0, frames, lambda _, full: mjx.step(model, full), full)
+        return PhysicsState(full.qpos, full.qvel, full.qacc_warmstart, overflow(full))
+
+    # The dynamics need whole float32 products, which NVIDIA GPUs do not give by default.
+    with jax.default_matmul_precision("highest"):
+        return jax.vmap(simulate)(data, ctrl)
+
+
+_ENGINES: dict[str, Callable[[mujoco.MjModel, int], StepBatch]] = {"native": _native, "jax": _jax, "warp": _warp}

@@ -1,0 +1,81 @@
+"""Batches of environments that stay one physics batch.
+
+    reset        keys -> states                 a plain vmap: it needs no physics
+    step         vmap(env.step), then the finished environments are really reset
+    reset_where  states of fresh episodes where the mask says so
+
+A physics engine wants one flat batch: nested vmaps break MJX-Warp and multiply host callbacks. So `step` and
+`reset_where` are flattened: an outer vmap over S turns [S, B, ...] into [S * B, ...], steps once, and turns the
+result back.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+from envs.batching import flattened
+
+
+class VectorEnv:
+    """`num_envs` (B) environments, stepped together. All leaves of a `State` have the leading axis [B].
+
+    `info["final_obs"]` [B, obs] is the observation after the step and before any reset. With `auto_reset`, an
+    environment that finishes starts a new episode (new goal, new start) within the same step: `obs`, `info["steps"]`
+    and the simulation are those of the new episode, while `reward`, `done`, `metrics` and `info["truncation"]` are
+    those of the step that finished. Without it `step` never resets.
+    """
+
+    def __init__(self, env: Env, num_envs: int, *, auto_reset: bool = True):
+        self.env = env
+        self.num_envs = num_envs
+        self.auto_reset = auto_reset
+        self._step = flattened(self._step_batch)
+        self._reset_where = flattened(self._reset_batch)
+
+    def reset(self, rng: jax.Array) -> State:
+        """New episodes [B] from one key, typed or raw."""
+        return self._begin(jax.random.split(rng, self.num_envs))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One env step of every environment; `action` [B, action_size]."""
+        return self._step(state, action)
+
+    def reset_where(self, state: State, mask: jax.Array, rng: jax.Array) -> State:
+        """New episodes where `mask` (bool [B]) is set; every other environment stays as it is, to the bit."""
+        return self._reset_where(state, mask, jax.random.split(rng, self.num_envs))
+
+    def _begin(self, rng: jax.Array) -> State:
+        """New episodes, one for each key of `rng` [n]. Each keeps a key of its own for the resets to come."""
+        rng, own = jnp.moveaxis(jax.vmap(jax.random.split)(rng), 1, 0)
+        state = jax.vmap(self.env.reset)(rng)
+        return state.replace(info={**state.info, "final_obs": state.obs, "rng": own})
+
+    def _step_batch(self, state: State, action: jax.Array) -> State:
+        state = jax.vmap(self.env.step)(state, action)
+        state = state.replace(info={**state.info, "final_obs": state.obs})
+        if not self.auto_reset:
+            return state
+        return jax.lax.cond((state.done > 0).any(), self._restart_done, lambda state: state, state)
+
+    def _restart_done(self, state: State) -> State:
+        """New episodes where one has finished, with what is told of the finished step kept."""
+        fresh = self._begin(state.info["rng"])
+        kept = {key: state.info[key] for key in ("truncation", "final_obs")}
+        fresh = fresh.replace(reward=state.reward, done=state.done, metrics=state.metrics, info={**fresh.info, **kept})
+        return _select(state.done > 0, fresh, state)
+
+    def _reset_batch(self, state: State, mask: jax.Array, rng: jax.Array) -> State:
+        return _select(mask, self._begin(rng), state)
+
+
+def _select(mask: jax.Array, yes: Any, no: Any) -> Any:
+    """`yes` where `mask` [n] is set, else `no`, leaf by leaf [n, ...]."""
+
+    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
+
+    return jax.tree.map(pick, yes, no)

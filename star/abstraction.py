@@ -1,0 +1,137 @@
+"""The abstraction: axis-aligned boxes, the regions, that cover the abstract state space exactly.
+
+Regions live in arrays of static capacity R with a mask, so that a split changes values and never shapes.
+Boxes are half-open, [lower, upper), except that the upper faces of the space belong to it. Splitting one box
+in two keeps two invariants that every other module relies on: the active boxes cover the space, and no two
+of them overlap. Both hold exactly in floating point, because neighbours share the very same number.
+
+Source: the set-based abstraction N of Zadem, Mover and Nguyen, ICLR 2024, section 3.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+T = TypeVar("T")
+
+
+class Abstraction(struct.PyTreeNode):
+    """All regions of a run. R is the capacity, d the number of abstract dimensions."""
+
+    lower: Float[Array, "R d"]
+    upper: Float[Array, "R d"]
+    count: Int[Array, ""]
+    space: Float[Array, "2 d"]
+
+    @property
+    def capacity(self) -> int:
+        """R, the largest possible number of regions."""
+        return self.lower.shape[0]
+
+    @property
+    def active(self) -> Bool[Array, "R"]:
+        """Mask of the regions in use; they are the first `count`."""
+        return jnp.arange(self.capacity) < self.count
+
+
+class Cut(NamedTuple):
+    """The plane `state[dimension] == position` through one region."""
+
+    region: Int[Array, ""]
+    dimension: Int[Array, ""]
+    position: Float[Array, ""]
+
+
+def create(space: tuple[ArrayLike, ArrayLike], cuts: Sequence[Sequence[float]], *, max_regions: int) -> Abstraction:
+    """The grid of boxes between the cut positions `cuts[dimension]` of `space` (lower and upper corner, [d]).
+
+    Raises:
+      ValueError: if the cuts are not increasing inside the space, or there are more boxes than `max_regions`.
+
+    """
+    low, high = (np.asarray(corner, np.float32) for corner in space)
+    if len(cuts) != len(low):
+        raise ValueError(f"{len(cuts)} lists of cuts for {len(low)} abstract dimensions")
+    intervals = []
+    for dimension, positions in enumerate(cuts):
+        edges = np.asarray([low[dimension], *positions, high[dimension]], np.float32)
+        if not np.all(np.diff(edges) > 0):
+            raise ValueError(
+                f"{list(positions)} do not increase between {low[dimension]:g} and {high[dimension]:g} "
+                f"in abstract dimension {dimension}"
+            )
+        intervals.append(list(itertools.pairwise(edges)))
+    boxes = np.asarray(list(itertools.product(*intervals)), np.float32)
+    count, d = boxes.shape[:2]
+    if count > max_regions:
+        raise ValueError(f"{count} initial regions exceed abstraction.max_regions {max_regions}")
+    lower, upper = np.zeros((2, max_regions, d), np.float32)
+    lower[:count], upper[:count] = boxes[..., 0], boxes[..., 1]
+    return Abstraction(
+        lower=jnp.asarray(lower),
+        upper=jnp.asarray(upper),
+        count=jnp.asarray(count, jnp.int32),
+        space=jnp.asarray(np.stack([low, high])),
+    )
+
+
+def locate(abstraction: Abstraction, point: Float[Array, "d"]) -> Int[Array, ""]:
+    """Index of the active region that holds `point`.
+
+    Boxes cover the space without overlap, so the answer is unique; a point outside the space goes to the region
+    nearest to it.
+    """
+    low, high = abstraction.space
+    inside = jnp.clip(point, low, jnp.nextafter(high, low))
+    holds = jnp.all((abstraction.lower <= inside) & (inside < abstraction.upper), axis=-1)
+    return jnp.argmax(holds & abstraction.active)
+
+
+def split(abstraction: Abstraction, cut: Cut, *, min_width: float | Array) -> tuple[Abstraction, Bool[Array, ""]]:
+    """Cut one region in two: it keeps the part below the cut, the new region `count` gets the part above.
+
+    Returns the abstraction unchanged, and False, if the table is full or a part would be narrower than `min_width`.
+    """
+    parent = cut.region
+    below, above = abstraction.lower[parent, cut.dimension], abstraction.upper[parent, cut.dimension]
+    wide_enough = (cut.position - below >= min_width) & (above - cut.position >= min_width)
+    strictly_inside = (below < cut.position) & (cut.position < above)
+    done = (abstraction.count < abstraction.capacity) & (parent < abstraction.count) & wide_enough & strictly_inside
+    child = jnp.minimum(abstraction.count, abstraction.capacity - 1)
+    lower = abstraction.lower.at[child].set(abstraction.lower[parent]).at[child, cut.dimension].set(cut.position)
+    upper = abstraction.upper.at[child].set(abstraction.upper[parent]).at[parent, cut.dimension].set(cut.position)
+    return (
+        abstraction.replace(
+            lower=jnp.where(done, lower, abstraction.lower),
+            upper=jnp.where(done, upper, abstraction.upper),
+            count=abstraction.count + done.astype(jnp.int32),
+        ),
+        done,
+    )
+
+
+def centre(abstraction: Abstraction) -> Float[Array, "R d"]:
+    """Centres of all boxes."""
+    return (abstraction.lower + abstraction.upper) / 2
+
+
+def inherit(table: Array, *, parent: Array, child: Array, axes: Sequence[int]) -> Array:
+    """Copy what `table` holds for region `parent` to region `child` along each of `axes` in turn."""
+    for axis in axes:
+        moved = jnp.moveaxis(table, axis, 0)
+        table = jnp.moveaxis(moved.at[child].set(moved[parent]), 0, axis)
+    return table
+
+
+def where(done: Bool[Array, ""], new: T, old: T) -> T:
+    """`new` if `done` else `old`, for whole pytrees."""
+    return jax.tree.map(lambda a, b: jnp.where(done, a, b), new, old)

@@ -1,0 +1,139 @@
+"""Checkpoints: whole runs on disk, written by orbax under `checkpoints/<env_steps>/` with their configuration inside.
+
+The latest few are kept and, besides, the one with the best evaluation.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import orbax.checkpoint as ocp
+from orbax.checkpoint import checkpoint_managers as policies
+
+from star.config import Config, ConfigError, fields, parse
+from star.state import TrainState
+
+FORMAT = 1
+_HARMLESS = (
+    "env.engine",
+    "trainer.total_env_steps",
+    "trainer.device",
+    "trainer.eval_",
+    "trainer.checkpoint_",
+    "trainer.keep_",
+)
+
+
+class Checkpoints:
+    """The checkpoints of one run directory."""
+
+    def __init__(self, run_dir: Path, *, keep: int = 3) -> None:
+        self._path = (run_dir / "checkpoints").absolute()
+        self._keep = keep
+        self._manager: ocp.CheckpointManager | None = None
+
+    def save(self, env_steps: int, state: TrainState, config: Config, *, success: float) -> None:
+        """Write `state` as `checkpoints/<env_steps>`; `success` is the latest evaluation's, which decides the best."""
+        self._open().save(
+            env_steps,
+            args=ocp.args.Composite(
+                state=ocp.args.StandardSave(_plain(state)),
+                config=ocp.args.JsonSave({"format": FORMAT, "config": config.model_dump(mode="json")}),
+            ),
+            metrics={"success_final": success},
+            force=True,
+        )
+
+    def steps(self) -> list[int]:
+        """Env steps of the checkpoints on disk, oldest first."""
+        if not self._path.is_dir():
+            return []
+        return sorted(int(entry.name) for entry in self._path.iterdir() if entry.name.isdigit())
+
+    def best(self) -> int:
+        """Env steps of the checkpoint with the best evaluation, the latest of equals."""
+        step = self._open().best_step()
+        return self.steps()[-1] if step is None else int(step)
+
+    def config(self, step: int) -> Config:
+        """The configuration inside a checkpoint."""
+        saved = self._open().restore(step, args=ocp.args.Composite(config=ocp.args.JsonRestore()))["config"]
+        if saved.get("format") != FORMAT:
+            raise ConfigError(f"{self._path / str(step)}: checkpoint format {saved.get('format')} is not {FORMAT}")
+        return parse(saved["config"], source=str(self._path / str(step)))
+
+    def restore(self, step: int, example: TrainState) -> TrainState:
+        """The state saved at `step`; `example` (arrays or their shapes) gives the structure it must have."""
+        template = jax.tree.map(ocp.utils.to_shape_dtype_struct, jax.eval_shape(_plain, example))
+        try:
+            args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
+            saved = self._open().restore(step, args=args)["state"]
+        except (ValueError, KeyError, TypeError) as error:
+            reason = " ".join(str(error).split())[:160]
+            raise ConfigError(f"{self._path / str(step)}: not a checkpoint of this configuration: {reason}") from None
+        return _with_keys(saved, example)
+
+    def close(self) -> None:
+        """Release orbax's threads."""
+        if self._manager is not None:
+            self._manager.close()
+            self._manager = None
+
+    def _open(self) -> ocp.CheckpointManager:
+        if self._manager is None:
+            keep = policies.AnyPreservationPolicy(
+                [
+                    policies.LatestN(self._keep),
+                    policies.BestN(get_metric_fn=_success, n=1, keep_checkpoints_without_metrics=False),
+                ]
+            )
+            self._manager = ocp.CheckpointManager(
+                self._path,
+                options=ocp.CheckpointManagerOptions(
+                    preservation_policy=keep,
+                    best_fn=_success,
+                    enable_async_checkpointing=False,
+                ),
+                item_names=("state", "config"),
+            )
+        return self._manager
+
+
+def check_compatible(saved: Config, wanted: Config, *, source: Path) -> None:
+    """Raise ConfigError, naming the first key that differs, if a checkpoint of `saved` cannot go on under `wanted`.
+
+    Numeric hyperparameters may change; the environment, shapes and algorithms may not.
+    """
+    before, after = (config.model_dump(mode="json") for config in (saved, wanted))
+    for key, default, _ in fields():
+        if isinstance(default, float) or key.startswith(_HARMLESS):
+            continue
+        old, new = _lookup(before, key), _lookup(after, key)
+        if old != new:
+            raise ConfigError(f"{source}: its checkpoint was made with {key} {old}, not {new}")
+
+
+def _lookup(values: dict[str, Any], dotted: str) -> Any:
+    for part in dotted.split("."):
+        values = values[part]
+    return values
+
+
+def _success(metrics: Any) -> float:
+    return metrics["success_final"]
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _plain(state: TrainState) -> TrainState:
+    """Random keys as the integers they are made of, which is what can be written."""
+    return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
+
+
+def _with_keys(saved: Any, example: TrainState) -> TrainState:
+    return jax.tree.map(lambda x, like: jax.random.wrap_key_data(x) if _is_key(like) else x, saved, example)

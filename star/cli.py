@@ -1,0 +1,197 @@
+"""The command `star`: train from a config file, evaluate what came out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any, NoReturn
+
+from star.config import Config, ConfigError, fields, load
+
+_HELP = """\
+Train a three-level agent (Commander, Tutor, Controller) whose goal regions refine themselves.
+
+  star train configs/point_maze.yaml            train; the result is in runs/point_maze-<time>/
+  star train configs/point_maze.yaml --seeds 5  five seeds side by side
+  star train configs/ant_maze.yaml --tutor.reward distance --total-env-steps 5000000
+  star train --resume runs/NAME                 go on after an interrupt
+  star evaluate runs/NAME                       success on test goals, with 95 % intervals
+  star envs                                     the tasks
+  star settings [PREFIX]                        every setting, its default and its meaning
+"""
+
+_OVERRIDES = "Any setting can be overridden: --section.key VALUE (see `star settings`)."
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{self.prog}: {message} (see {self.prog} --help)")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code: 0 done, 2 bad input, 130 interrupted."""
+    try:
+        return _run(sys.argv[1:] if arguments is None else list(arguments))
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def _run(arguments: list[str]) -> int:
+    parser = _parser()
+    options, rest = parser.parse_known_args(arguments)
+    if options.command is None:
+        parser.print_help()
+        return 0
+    overrides = _overrides(rest, options)
+    return options.function(options, overrides)
+
+
+def _parser() -> argparse.ArgumentParser:
+    shape: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
+    parser = _Parser(prog="star", description=_HELP, **shape)
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+
+    train = commands.add_parser("train", help="train from a config file", description=_OVERRIDES, **shape)
+    train.add_argument("config", nargs="?", type=Path, help="YAML file, such as configs/point_maze.yaml")
+    train.add_argument("--resume", type=Path, metavar="RUN", help="go on with the run in this directory")
+    train.add_argument("--run-dir", type=Path, metavar="DIR", help="where to write (default: runs/CONFIG-TIME)")
+    train.add_argument("--seed", dest="trainer.seed", metavar="N", help="first seed")
+    train.add_argument("--seeds", dest="trainer.num_seeds", metavar="N", help="seeds trained side by side")
+    train.add_argument("--total-env-steps", dest="trainer.total_env_steps", metavar="N", help="env steps per seed")
+    train.add_argument("--quiet", action="store_true", help="no progress")
+    train.set_defaults(function=_train)
+
+    evaluate = commands.add_parser("evaluate", help="success on test goals", description=_OVERRIDES, **shape)
+    evaluate.add_argument("run", type=Path, help="run directory")
+    evaluate.add_argument("--episodes", dest="trainer.eval_episodes", metavar="N", help="episodes per seed")
+    evaluate.add_argument("--checkpoint", default="last", metavar="last|best|STEPS", help="which one (default: last)")
+    evaluate.add_argument("--evaluation-seed", type=int, default=0, metavar="N", help="seed of goals and starts")
+    evaluate.add_argument("--json", action="store_true", help="print JSON")
+    evaluate.set_defaults(function=_evaluate)
+
+    listing = commands.add_parser("envs", help="list the tasks", **shape)
+    listing.set_defaults(function=_envs)
+    settings = commands.add_parser("settings", help="list every setting with its default and meaning", **shape)
+    settings.add_argument("prefix", nargs="?", default="", help="only settings that begin so, such as tutor")
+    settings.set_defaults(function=_settings)
+    return parser
+
+
+def _overrides(rest: Sequence[str], options: argparse.Namespace) -> dict[str, Any]:
+    """Dotted settings from `--section.key VALUE` or `--section.key=VALUE`, and from the named flags."""
+    found: dict[str, Any] = {k: v for k, v in vars(options).items() if "." in k and v is not None}
+    waiting = list(rest)
+    while waiting:
+        flag = waiting.pop(0)
+        name, equals, value = flag.removeprefix("--").partition("=")
+        if not flag.startswith("--") or "." not in name:
+            raise ConfigError(f"{flag}: unknown argument; settings are given as --section.key VALUE")
+        if not equals:
+            if not waiting:
+                raise ConfigError(f"{flag}: needs a value")
+            value = waiting.pop(0)
+        found[name] = value
+    return {name: _value(text) for name, text in found.items()}
+
+
+def _value(text: str) -> Any:
+    """Lists and mappings as in YAML; everything else is left to the validation of the config."""
+    import yaml
+
+    if text[:1] in "[{" or text in ("true", "false", "null"):
+        try:
+            return yaml.safe_load(text)
+        except yaml.YAMLError:
+            return text
+    return text
+
+
+def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    if (options.config is None) == (options.resume is None):
+        raise ConfigError("star train: give either a config file or --resume RUN (see star train --help)")
+    if options.resume is not None:
+        if options.run_dir is not None:
+            raise ConfigError("--run-dir: a resumed run stays where it is")
+        run_dir = options.resume
+        config = _run_config(run_dir, overrides)
+    else:
+        config = load(options.config, overrides)
+        run_dir = options.run_dir or Path("runs") / f"{options.config.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+
+    from star import trainer
+
+    result = trainer.train(config, run_dir, resume=options.resume is not None, quiet=options.quiet)
+    if result.interrupted:
+        print(f"interrupted at {result.env_steps:,} env steps; go on with: star train --resume {run_dir}")
+        return 130
+    success = "" if result.success_final is None else f", success_final {result.success_final:.2f} on test goals"
+    print(f"trained {result.env_steps:,} env steps{success}")
+    print(f"figure:  {run_dir}/figures/summary.png\nmetrics: {run_dir}/metrics.jsonl\nnext:    star evaluate {run_dir}")
+    return 0
+
+
+def _evaluate(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    config = _run_config(options.run, {"env.engine": "auto"} | overrides)
+
+    from star import trainer
+
+    report = trainer.evaluate(config, options.run, checkpoint=options.checkpoint, seed=options.evaluation_seed)
+    if options.json:
+        print(json.dumps(report))
+        return 0
+    print(f"{report['env']} ({report['engine']}), checkpoint at {report['env_steps']:,} env steps")
+    for row in report["seeds"]:
+        print(f"seed {row['seed']}: " + _describe(row))
+    if len(report["seeds"]) > 1:
+        print("all seeds: " + _describe(report))
+    return 0
+
+
+def _describe(row: dict[str, Any]) -> str:
+    parts = [f"{row['episodes']} episodes"]
+    for name, digits in (("success_any", 3), ("success_final", 3), ("distance", 2), ("return", 1)):
+        low, high = row[f"{name}_interval"]
+        parts.append(f"{name} {row[name]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]")
+    return "  ".join(parts)
+
+
+def _envs(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    import envs
+
+    _refuse(overrides)
+    print("\n".join(envs.names()))
+    return 0
+
+
+def _settings(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    _refuse(overrides)
+    rows = [row for row in fields() if row[0].startswith(options.prefix)]
+    if not rows:
+        raise ConfigError(f"{options.prefix}: no setting begins so; sections are {', '.join(Config.model_fields)}")
+    width = max(len(key) for key, _, _ in rows)
+    for key, default, description in rows:
+        print(f"{key:{width}}  {description} (default {json.dumps(default)})")
+    return 0
+
+
+def _refuse(overrides: dict[str, Any]) -> None:
+    for key in overrides:
+        raise ConfigError(f"--{key}: this command takes no settings")
+
+
+def _run_config(run_dir: Path, overrides: dict[str, Any]) -> Config:
+    path = run_dir / "config.yaml"
+    if not path.is_file():
+        raise ConfigError(f"{run_dir}: is not a run directory, it holds no config.yaml")
+    return load(path, overrides)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

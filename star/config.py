@@ -1,0 +1,355 @@
+"""Configuration: one YAML file and dotted overrides become one frozen, validated object.
+
+Every section is a pytree. Its float fields are leaves, everything else is static structure, so the agent's
+sections can be passed through `jax.jit` and batched with `jax.vmap` to train several values of a numeric
+hyperparameter side by side.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import jax
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic_core import ErrorDetails
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message is one line for the user."""
+
+
+class Section(BaseModel):
+    """A frozen group of settings that refuses unknown keys and is a JAX pytree with its floats as leaves."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _refuse_booleans_as_numbers(cls, value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, bool) and cls.model_fields[str(info.field_name)].annotation in (int, float):
+            raise ValueError("should be a number")
+        return value
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        super().__pydantic_init_subclass__(**kwargs)
+        jax.tree_util.register_pytree_with_keys(cls, _flatten, lambda aux, leaves: _unflatten(cls, aux, leaves))
+
+
+def _is_leaf_field(cls: type[Section], name: str) -> bool:
+    annotation = cls.model_fields[name].annotation
+    return annotation is float or (isinstance(annotation, type) and issubclass(annotation, Section))
+
+
+def _flatten(section: Section) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+    cls = type(section)
+    leaves = [(jax.tree_util.GetAttrKey(n), getattr(section, n)) for n in cls.model_fields if _is_leaf_field(cls, n)]
+    static = tuple((n, getattr(section, n)) for n in cls.model_fields if not _is_leaf_field(cls, n))
+    return leaves, static
+
+
+def _unflatten(cls: type[Section], static: tuple[Any, ...], leaves: Iterable[Any]) -> Section:
+    names = [n for n in cls.model_fields if _is_leaf_field(cls, n)]
+    return cls.model_construct(**dict(zip(names, leaves, strict=True)), **dict(static))
+
+
+Positive = Annotated[int, Field(gt=0)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class EnvConfig(Section):
+    """The task and the engine that simulates it."""
+
+    name: str = Field("point_maze", description="task, one of `star envs`")
+    engine: Literal["auto", "warp", "jax", "native"] = Field("auto", description="physics engine")
+    options: dict[str, Any] = Field({}, description="options of the task, passed to envs.make")
+
+
+class PPOConfig(Section):
+    """Proximal policy optimisation (Schulman et al. 2017) with an adaptive learning rate."""
+
+    hidden: tuple[Positive, ...] = Field((256, 256, 128), description="widths of the actor's and critic's layers")
+    learning_rate: float = Field(5e-4, gt=0, description="initial Adam step size")
+    max_learning_rate: float = Field(1e-3, gt=0, description="ceiling of the adaptive step size")
+    target_kl: float = Field(0.016, gt=0, description="KL divergence per pass that the step size aims at")
+    discount: float = Field(0.95, ge=0, le=1, description="gamma per decision of the level")
+    gae_lambda: float = Field(0.95, ge=0, le=1, description="lambda of generalised advantage estimation")
+    clip: float = Field(0.2, gt=0, description="clip range of the probability ratio")
+    entropy: float = Field(0.0, ge=0, description="weight of the entropy bonus")
+    passes: Positive = Field(4, description="passes over each rollout")
+    minibatches: Positive = Field(8, description="minibatches per pass")
+    initial_std: float = Field(0.8, gt=0, description="initial standard deviation of actions in [-1, 1]")
+    min_std: float = Field(0.05, gt=0, description="floor of the standard deviation")
+    max_grad_norm: float = Field(1.0, gt=0, description="global gradient norm is clipped to this")
+
+
+class TD3Config(Section):
+    """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018), as published for STAR."""
+
+    hidden: tuple[Positive, ...] = Field((300, 300), description="widths of the actor's and critics' layers")
+    actor_learning_rate: float = Field(1e-4, gt=0, description="Adam step size of the actor")
+    critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step size of the critics")
+    discount: float = Field(0.95, ge=0, le=1, description="gamma per decision of the level")
+    tau: float = Field(0.005, gt=0, le=1, description="rate at which the target networks follow")
+    batch_size: Positive = Field(128, description="transitions per update")
+    buffer_size: Positive = Field(200_000, description="transitions kept in the replay buffer")
+    min_transitions: Positive = Field(1000, description="transitions needed before the first update")
+    updates_per_rollout: Positive = Field(10, description="gradient updates after each rollout")
+    policy_delay: Positive = Field(2, description="critic updates per actor update")
+    target_noise: float = Field(0.2, ge=0, description="smoothing noise of target actions in [-1, 1]")
+    target_noise_clip: float = Field(0.5, ge=0, description="clip of the smoothing noise")
+    exploration_noise: float = Field(0.1, ge=0, description="standard deviation of exploration, actions in [-1, 1]")
+
+
+class CommanderConfig(Section):
+    """The Commander: tabular Q-learning over regions."""
+
+    period: Positive = Field(30, description="k: env steps between the Commander's decisions")
+    learning_rate: float = Field(0.01, gt=0, le=1, description="alpha, applied once per stream and visited cell")
+    discount: float = Field(0.95, ge=0, lt=1, description="gamma per decision")
+    epsilon_start: float = Field(0.5, ge=0, le=1, description="share of random targets at the start")
+    epsilon_end: float = Field(0.1, ge=0, le=1, description="share of random targets after epsilon_steps")
+    epsilon_steps: float = Field(1e6, gt=0, description="env steps over which epsilon falls linearly")
+    successors: Literal["possible", "known"] = Field(
+        "possible", description="greedy choice among all targets not shown unreachable, or the known-reachable only"
+    )
+    goal_margin: float = Field(
+        1.0, gt=0, description="half-width of the box around g* given to the Tutor in its region"
+    )
+
+
+class LevelConfig(Section):
+    """What Tutor and Controller have in common: a learner and a reward."""
+
+    learner: Literal["ppo", "td3"] = Field("ppo", description="learning algorithm")
+    reward: Literal["distance", "progress"] = Field("progress", description="minus the distance, or its decrease")
+    reward_scale: float = Field(1.0, gt=0, description="factor on the reward")
+    ppo: PPOConfig = Field(PPOConfig(), description="settings used when learner is ppo")
+    td3: TD3Config = Field(TD3Config(), description="settings used when learner is td3")
+
+
+class TutorConfig(LevelConfig):
+    """The Tutor: chooses the subgoal on the way to the target region."""
+
+    period: Positive = Field(10, description="l: env steps between the Tutor's decisions")
+    unroll: Positive = Field(5, description="decisions of each environment per update")
+    relative_bounds: bool = Field(True, description="observe the region's bounds relative to the agent")
+    off_policy_correction: bool = Field(False, description="relabel replayed subgoals (HIRO); needs learner td3")
+    correction_candidates: Positive = Field(10, description="random candidates of the off-policy correction")
+
+    @model_validator(mode="after")
+    def _correction_needs_replay(self) -> Self:
+        if self.off_policy_correction and self.learner != "td3":
+            raise ValueError("off_policy_correction needs learner td3, which replays old subgoals")
+        return self
+
+
+class ControllerConfig(LevelConfig):
+    """The Controller: drives the joints towards the subgoal."""
+
+
+class AbstractionConfig(Section):
+    """The regions the Commander chooses from."""
+
+    max_regions: Annotated[int, Field(ge=1, le=1024)] = Field(64, description="capacity of the table of regions")
+    cuts: tuple[tuple[float, ...], ...] | None = Field(
+        None, description="initial cut positions per abstract dimension; by default those of the task"
+    )
+    min_width: float = Field(1.0, gt=0, description="no region is cut narrower than this (units of the state)")
+
+
+class ForwardModelConfig(Section):
+    """F_k: predicts where k steps under a commanded region lead."""
+
+    hidden: tuple[Positive, ...] = Field((32, 32), description="widths of the ReLU layers")
+    learning_rate: float = Field(1e-3, gt=0, description="Adam step size")
+    batch_size: Positive = Field(512, description="transitions per update")
+    buffer_size: Positive = Field(100_000, description="transitions kept")
+    updates_per_epoch: Positive = Field(200, description="gradient updates after each epoch")
+    residual: bool = Field(True, description="predict the displacement instead of the final state")
+
+
+class RefinementConfig(Section):
+    """When and where a region is split."""
+
+    enabled: bool = Field(True, description="false keeps the initial regions")
+    min_transitions: Positive = Field(5000, description="commanded transitions before a pair is examined")
+    error_tolerance: float = Field(
+        0.1, ge=0, description="the model's error on a pair is stable once it falls by less than this share an epoch"
+    )
+    reach_share: float = Field(0.7, gt=0, le=1, description="c1: share of the hull inside the target that reaches")
+    miss_share: float = Field(0.1, ge=0, lt=1, description="tau2: share of the target covered below which a box misses")
+    depth: Annotated[int, Field(ge=1, le=8)] = Field(5, description="boxes are halved this often: 5 is 1/32")
+    min_visits: Positive = Field(100, description="visited start states a reaching box needs")
+    pairs_per_epoch: Positive = Field(4, description="pairs examined after each epoch")
+    cuts_per_pair: Positive = Field(1, description="cuts one examined pair may make")
+    miss_lifetime: Positive = Field(10, description="epochs after which a MISSES verdict is forgotten")
+
+
+class TrainerConfig(Section):
+    """The host loop around the jitted epoch."""
+
+    num_envs: Positive = Field(128, description="environments stepped together, per seed")
+    total_env_steps: Positive = Field(2_000_000, description="env steps of all environments, per seed")
+    seed: Count = Field(0, description="first seed")
+    num_seeds: Positive = Field(1, description="seeds trained side by side: seed, seed + 1, ...")
+    eval_every: Positive = Field(2, description="epochs between evaluations")
+    eval_episodes: Positive = Field(100, description="episodes of each evaluation, per seed")
+    checkpoint_every: Positive = Field(5, description="epochs between checkpoints")
+    keep_checkpoints: Positive = Field(3, description="latest checkpoints kept, besides the best")
+    device: Literal["auto", "cpu", "gpu"] = Field("auto", description="where to train")
+
+
+class Config(Section):
+    """A whole experiment."""
+
+    env: EnvConfig = EnvConfig()
+    commander: CommanderConfig = CommanderConfig()
+    tutor: TutorConfig = TutorConfig()
+    controller: ControllerConfig = ControllerConfig()
+    abstraction: AbstractionConfig = AbstractionConfig()
+    forward_model: ForwardModelConfig = ForwardModelConfig()
+    refinement: RefinementConfig = RefinementConfig()
+    trainer: TrainerConfig = TrainerConfig()
+
+    @model_validator(mode="after")
+    def _periods_fit(self) -> Self:
+        if self.commander.period % self.tutor.period:
+            raise ValueError(
+                f"commander.period: {self.commander.period} is not a multiple of tutor.period {self.tutor.period}"
+            )
+        for name, section in (("tutor", self.tutor), ("controller", self.controller)):
+            decisions = self.tutor.unroll if name == "tutor" else self.tutor.period
+            rollout = decisions * self.trainer.num_envs
+            if section.learner == "ppo" and rollout % section.ppo.minibatches:
+                raise ValueError(
+                    f"{name}.ppo.minibatches: {section.ppo.minibatches} does not divide the rollout of {rollout} "
+                    f"decisions ({decisions} of each of {self.trainer.num_envs} environments)"
+                )
+        return self
+
+    def agent(self) -> AgentConfig:
+        """The sections that the jitted program sees."""
+        return AgentConfig(**{name: getattr(self, name) for name in AgentConfig.model_fields})
+
+    def to_yaml(self) -> str:
+        """Every resolved value as YAML that `load` accepts."""
+        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+
+
+class AgentConfig(Section):
+    """The part of a `Config` that the jitted program sees; its floats are traced."""
+
+    commander: CommanderConfig
+    tutor: TutorConfig
+    controller: ControllerConfig
+    abstraction: AbstractionConfig
+    forward_model: ForwardModelConfig
+    refinement: RefinementConfig
+
+
+def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
+    """Read a YAML file, apply dotted overrides such as `{"tutor.period": 5}` and validate.
+
+    Raises:
+      ConfigError: with one line that names the key, the value and what is allowed.
+
+    """
+    path = Path(path)
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file{_nearest_file(path)}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1} column {mark.column + 1}:" if mark else ""
+        raise ConfigError(f"{path}:{where} not valid YAML: {getattr(error, 'problem', None) or 'bad input'}") from None
+    except (RecursionError, ValueError) as error:
+        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: should hold sections such as `trainer:`, not {_show(values)}")
+    return parse(values, overrides, source=str(path))
+
+
+def parse(
+    values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, *, source: str = "configuration"
+) -> Config:
+    """Validate nested `values` after applying dotted `overrides`; raises `ConfigError`."""
+    nested = _with_overrides(values, overrides or {})
+    try:
+        return Config.model_validate(nested)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_explain(error.errors()[0])}") from None
+
+
+def fields(section: type[Section] = Config, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
+    """All settings as (dotted key, default, description)."""
+    for name, field in section.model_fields.items():
+        annotation = field.annotation
+        if isinstance(annotation, type) and issubclass(annotation, Section):
+            yield from fields(annotation, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", field.default, field.description or ""
+
+
+def _with_overrides(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    nested = {key: dict(value) if isinstance(value, Mapping) else value for key, value in values.items()}
+    for dotted, value in overrides.items():
+        *parents, last = dotted.split(".")
+        level = nested
+        for parent in parents:
+            child = level.get(parent)
+            level[parent] = dict(child) if isinstance(child, Mapping) else {}
+            level = level[parent]
+        level[last] = value
+    return nested
+
+
+def _explain(error: ErrorDetails) -> str:
+    """One pydantic error as one line: key, value, what is allowed."""
+    path = [str(part) for part in error["loc"]]
+    key = ".".join(path)
+    if error["type"] == "extra_forbidden":
+        return f"{key}: unknown key{_nearest_key(path)}"
+    message = error["msg"].removeprefix("Value error, ").replace("Input should be", "should be")
+    message = message[:1].lower() + message[1:]
+    if error["type"] == "value_error" and not isinstance(error["input"], str | int | float | bool):
+        return f"{key}: {message}" if key else message
+    return f"{key}: {_show(error['input'])} is not allowed: {message}" if key else message
+
+
+def _nearest_key(path: Sequence[str]) -> str:
+    """` (did you mean ...?)` with the most similar valid key, looked for in the section and then everywhere."""
+    section: Any = Config
+    for part in path[:-1]:
+        section = section.model_fields[part].annotation
+    matches = difflib.get_close_matches(path[-1], section.model_fields, n=1, cutoff=0.5)
+    if matches:
+        return f" (did you mean {'.'.join([*path[:-1], matches[0]])}?)"
+    everywhere = {key.rsplit(".", 1)[-1]: key for key, _, _ in fields()}
+    matches = difflib.get_close_matches(path[-1], everywhere, n=1, cutoff=0.8)
+    if matches:
+        return f" (did you mean {everywhere[matches[0]]}?)"
+    return f" (allowed: {', '.join(section.model_fields)})"
+
+
+def _nearest_file(path: Path) -> str:
+    if not path.parent.is_dir():
+        return ""
+    names = [entry.name for entry in path.parent.iterdir() if entry.suffix in (".yaml", ".yml")]
+    matches = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
+    return f" (did you mean {path.parent / matches[0]}?)" if matches else ""
+
+
+def _show(value: Any, limit: int = 60) -> str:
+    text = "nan" if isinstance(value, float) and math.isnan(value) else repr(value)
+    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,0 +1,239 @@
+"""Episodes: the clocks of the levels, and how the three of them act together in B environments.
+
+    where the clock is 0:  the Commander chooses a target region
+    every l env steps:     the Tutor chooses a subgoal
+    every env step:        the Controller acts, and the subgoal moves with the agent
+
+Clocks restart with every episode. Environments that end early wait until the segment of l env steps is over.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State as EnvState
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from envs.vector import VectorEnv
+from star import abstraction as regions
+from star import commander, controller, learner, tutor
+from star.abstraction import Abstraction
+from star.commander import Successors
+from star.config import AgentConfig
+from star.state import Spec, TrainState
+from star.tutor import Box
+
+
+class Streams(struct.PyTreeNode):
+    """The B environments and where each stands in its Commander period."""
+
+    env: EnvState
+    clock: Int[Array, "B"]
+    region: Int[Array, "B"]
+    goal_region: Int[Array, "B"]
+    target: Int[Array, "B"]
+    box: Box
+    start: Float[Array, "B d"]
+    best: Float[Array, "B"]
+    episode: Episode
+
+
+class Episode(struct.PyTreeNode):
+    """Running statistics of each environment's episode."""
+
+    success_any: Float[Array, "B"]
+    success_final: Float[Array, "B"]
+    distance: Float[Array, "B"]
+    total: Float[Array, "B"]
+
+    @classmethod
+    def start(cls, num_envs: int) -> Episode:
+        """Before the first step."""
+        return cls(*(jnp.zeros(num_envs) for _ in range(4)))
+
+
+class Steps(struct.PyTreeNode):
+    """One segment step by step, leading axes [l, B]. `alive` is 1 until the environment has ended."""
+
+    obs: Float[Array, "l B obs"]
+    next_obs: Float[Array, "l B obs"]
+    subgoal: Float[Array, "l B d"]
+    next_subgoal: Float[Array, "l B d"]
+    action: Float[Array, "l B act"]
+    reward: Float[Array, "l B"]
+    terminated: Float[Array, "l B"]
+    alive: Float[Array, "l B"]
+
+
+def evaluate(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, *, key: Array) -> Episode:
+    """One greedy episode of every environment of `env`; nothing is learnt."""
+    reset_key, scan_key = jax.random.split(key)
+    streams = start(spec, env, state.abstraction, key=reset_key)
+    allowed = successors(config, state)
+
+    def segment(streams: Streams, key: Array) -> tuple[Streams, None]:
+        command_key, tutor_key, rollout_key = jax.random.split(key, 3)
+        streams = command(config, spec, state, allowed, streams, epsilon=0.0, key=command_key)
+        subgoal, _ = choose_subgoal(config, spec, state, streams, deterministic=True, key=tutor_key)
+        streams, steps = rollout(config, spec, env, state, streams, subgoal, deterministic=True, key=rollout_key)
+        return advance(config, streams, steps), None
+
+    segments = spec.episode_length // config.tutor.period
+    return jax.lax.scan(segment, streams, jax.random.split(scan_key, segments))[0].episode
+
+
+def start(spec: Spec, env: VectorEnv, abstraction: Abstraction, *, key: Array) -> Streams:
+    """Fresh environments with their clocks at 0."""
+    env_state = env.reset(key)
+    n = env.num_envs
+    nothing = jnp.zeros(n, jnp.int32)
+    abstract = spec.abstract(env_state.obs)
+    return Streams(
+        env=env_state,
+        clock=nothing,
+        region=nothing,
+        goal_region=nothing,
+        target=nothing,
+        box=Box(lower=jnp.zeros_like(abstract), upper=jnp.zeros_like(abstract)),
+        start=abstract,
+        best=jnp.full(n, -jnp.inf),
+        episode=Episode.start(n),
+    )
+
+
+def successors(config: AgentConfig, state: TrainState) -> Successors:
+    """Targets that the graph allows from each region under `commander.successors`."""
+    return commander.successors(
+        config.commander.successors,
+        reaches=state.graph.reaches,
+        misses=state.graph.misses,
+        active=state.abstraction.active,
+    )
+
+
+def command(
+    config: AgentConfig,
+    spec: Spec,
+    state: TrainState,
+    allowed: Successors,
+    streams: Streams,
+    *,
+    epsilon: Float[Array, ""] | float,
+    key: Array,
+) -> Streams:
+    """The Commander's decision, for the streams whose clock is 0."""
+    obs = streams.env.obs
+    locate = jax.vmap(partial(regions.locate, state.abstraction))
+    region, goal_region = locate(spec.abstract(obs)), locate(spec.goal_point(obs))
+    target = commander.act(state.commander, allowed, region, goal_region, epsilon=epsilon, key=key)
+    fresh = Streams(
+        env=streams.env,
+        clock=streams.clock,
+        region=region,
+        goal_region=goal_region,
+        target=target,
+        box=target_box(config, spec, state.abstraction, target, goal_region, spec.goal_point(obs)),
+        start=spec.abstract(obs),
+        best=jnp.full_like(streams.best, -jnp.inf),
+        episode=streams.episode,
+    )
+    return _select(streams.clock == 0, fresh, streams)
+
+
+def target_box(
+    config: AgentConfig,
+    spec: Spec,
+    abstraction: Abstraction,
+    target: Int[Array, "B"],
+    goal_region: Int[Array, "B"],
+    goal_point: Float[Array, "B d"],
+) -> Box:
+    """Bounds that the Tutor is given: those of the target region, or g* +- margin if g* lies in that region."""
+    margin = config.commander.goal_margin
+    around = (target == goal_region)[:, None] & spec.in_goal()
+    lower, upper = abstraction.lower[target], abstraction.upper[target]
+    return Box(lower=jnp.where(around, goal_point - margin, lower), upper=jnp.where(around, goal_point + margin, upper))
+
+
+def choose_subgoal(
+    config: AgentConfig, spec: Spec, state: TrainState, streams: Streams, *, deterministic: bool, key: Array
+) -> tuple[Float[Array, "B d"], Float[Array, "B d"]]:
+    """(subgoal, action) of the Tutor in every environment."""
+    obs = streams.env.obs
+    seen = tutor.observe(config.tutor, spec.state(obs), spec.abstract(obs), streams.box)
+    action = learner.act(config.tutor, state.tutor, seen, deterministic=deterministic, key=key)
+    return tutor.subgoal(action, spec.scale), action
+
+
+def rollout(
+    config: AgentConfig,
+    spec: Spec,
+    env: VectorEnv,
+    state: TrainState,
+    streams: Streams,
+    subgoal: Float[Array, "B d"],
+    *,
+    deterministic: bool,
+    key: Array,
+) -> tuple[Streams, Steps]:
+    """L env steps under one subgoal per environment. Environments that end stay as they are in the statistics."""
+
+    def step(carry: tuple[EnvState, Array, Array, Episode], step_key: Array) -> tuple[tuple, Steps]:
+        env_state, subgoal, alive, episode = carry
+        obs = env_state.obs
+        seen = controller.observe(spec.state(obs), subgoal, position=spec.abstract_indices)
+        action = learner.act(config.controller, state.controller, seen, deterministic=deterministic, key=step_key)
+        env_state = env.step(env_state, action)
+        after = controller.next_subgoal(subgoal, spec.abstract(obs), spec.abstract(env_state.obs))
+        steps = Steps(
+            obs=obs,
+            next_obs=env_state.obs,
+            subgoal=subgoal,
+            next_subgoal=after,
+            action=action,
+            reward=env_state.reward,
+            terminated=env_state.done * (1 - env_state.info["truncation"]),
+            alive=alive,
+        )
+        return (env_state, after, alive * (1 - env_state.done), _record(episode, env_state, alive)), steps
+
+    carry = (streams.env, subgoal, jnp.ones(env.num_envs), streams.episode)
+    (env_state, _, _, episode), steps = jax.lax.scan(step, carry, jax.random.split(key, config.tutor.period))
+    best = jnp.maximum(streams.best, jnp.where(steps.alive > 0, steps.reward, -jnp.inf).max(axis=0))
+    return streams.replace(env=env_state, episode=episode, best=best), steps
+
+
+def advance(config: AgentConfig, streams: Streams, steps: Steps) -> Streams:
+    """Move the clocks on by one segment; they return to 0 at the end of a period."""
+    return streams.replace(clock=(streams.clock + config.tutor.period) % config.commander.period)
+
+
+def restart_ended(config: AgentConfig, env: VectorEnv, streams: Streams, steps: Steps, *, key: Array) -> Streams:
+    """Reset the environments that terminated in this segment, with clocks and statistics at their start."""
+    ended = jnp.max(steps.terminated * steps.alive, axis=0) > 0
+    env_state = env.reset_where(streams.env, ended, key)
+    restarted = streams.replace(clock=jnp.zeros_like(streams.clock), episode=Episode.start(env.num_envs), env=env_state)
+    return _select(ended, restarted, streams.replace(env=env_state))
+
+
+def _record(episode: Episode, env_state: EnvState, alive: Float[Array, "B"]) -> Episode:
+    success, distance = env_state.metrics["success"], env_state.metrics["distance"]
+    return Episode(
+        success_any=jnp.maximum(episode.success_any, success * alive),
+        success_final=jnp.where(alive > 0, success, episode.success_final),
+        distance=jnp.where(alive > 0, distance, episode.distance),
+        total=episode.total + env_state.reward * alive,
+    )
+
+
+def _select(mask: Bool[Array, "B"], new: Streams, old: Streams) -> Streams:
+    """`new` where `mask`, else `old`, environment by environment; the environments' own state is `new`'s."""
+
+    def pick(a: Array, b: Array) -> Array:
+        return jnp.where(mask.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+
+    chosen = jax.tree.map(pick, new.replace(env=None), old.replace(env=None))
+    return chosen.replace(env=new.env)

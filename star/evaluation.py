@@ -1,0 +1,49 @@
+"""Evaluation: greedy episodes on goals and seeds of their own, summarised with 95 % intervals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from star.episode import Episode
+
+
+def summarise(episode: Episode) -> dict[str, Any]:
+    """Statistics of the episodes of one seed (arrays [E]).
+
+    `success_any` and `success_final` come with Wilson score intervals, `distance` (units of the state, at the end of
+    the episode) and `return` (sum of -||g* - s||) with Student's t intervals. Keys ending in `_interval` hold
+    [low, high] at 95 %.
+    """
+    any_, final, distance, total = (
+        np.asarray(x, np.float64).ravel()
+        for x in (episode.success_any, episode.success_final, episode.distance, episode.total)
+    )
+    return {
+        "episodes": len(any_),
+        "success_any": float(any_.mean()),
+        "success_any_interval": proportion_interval(int(any_.sum()), len(any_)),
+        "success_final": float(final.mean()),
+        "success_final_interval": proportion_interval(int(final.sum()), len(final)),
+        "distance": float(distance.mean()),
+        "distance_interval": mean_interval(distance),
+        "return": float(total.mean()),
+        "return_interval": mean_interval(total),
+    }
+
+
+def proportion_interval(successes: int, trials: int) -> list[float]:
+    """Wilson score interval of a proportion at 95 %."""
+    interval = stats.binomtest(successes, trials).proportion_ci(0.95, method="wilson")
+    return [float(interval.low), float(interval.high)]
+
+
+def mean_interval(values: np.ndarray) -> list[float]:
+    """Student's t interval of a mean at 95 %; a single value is its own interval."""
+    mean = float(values.mean())
+    if len(values) < 2:
+        return [mean, mean]
+    half = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
+    return [mean - half, mean + half]

@@ -1,0 +1,141 @@
+"""F_k: where k env steps lead from an abstract state when a box is commanded.
+
+    F_k(s, [lower, upper]) = s + f(...)   (`residual`)   or   f(...),      f a ReLU network trained by MSE
+
+It is trained on commanded boxes, reached or not, so that it also predicts failures. Its error on new transitions is
+measured before they enter the buffer, so the error kept per pair of regions is always a held-out one.
+
+Source: STAR (ICLR 2024), section 4.3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float
+
+from star import replay
+from star.config import ForwardModelConfig
+from star.networks import MLP, apply
+from star.reachability import Network
+
+Metrics = dict[str, Array]
+
+
+class Outcome(struct.PyTreeNode):
+    """Periods of k env steps: where they began, which box was commanded, where they ended. `weight` masks."""
+
+    start: Float[Array, "*N d"]
+    lower: Float[Array, "*N d"]
+    upper: Float[Array, "*N d"]
+    end: Float[Array, "*N d"]
+    weight: Float[Array, "*N"]
+
+
+class ForwardModelState(struct.PyTreeNode):
+    """Network, optimiser and buffer. `space` [2, d] scales inputs and outputs."""
+
+    params: Mapping[str, Any]
+    optimizer: optax.OptState
+    ring: replay.Ring
+    space: Float[Array, "2 d"]
+
+
+def _mlp(config: ForwardModelConfig, d: int) -> MLP:
+    return MLP(config.hidden, d)
+
+
+def init(key: Array, config: ForwardModelConfig, *, space: Float[Array, "2 d"]) -> ForwardModelState:
+    """An untrained model for the abstract space with corners `space`."""
+    d = space.shape[1]
+    point = jnp.zeros(d)
+    params = _mlp(config, d).init(key, jnp.zeros(3 * d))
+    example = Outcome(start=point, lower=point, upper=point, end=point, weight=jnp.zeros(()))
+    return ForwardModelState(
+        params=params,
+        optimizer=optax.scale_by_adam().init(params),
+        ring=replay.create(example, size=config.buffer_size),
+        space=space,
+    )
+
+
+def predict(
+    config: ForwardModelConfig,
+    state: ForwardModelState,
+    start: Float[Array, "*N d"],
+    lower: Float[Array, "*N d"],
+    upper: Float[Array, "*N d"],
+) -> Float[Array, "*N d"]:
+    """Expected abstract state k steps after commanding the box [lower, upper] in `start`."""
+    return _predict(config, state.params, state.space, start, lower, upper)
+
+
+def network(
+    config: ForwardModelConfig, state: ForwardModelState, lower: Float[Array, "d"], upper: Float[Array, "d"]
+) -> Network:
+    """The model for one commanded box as a plain ReLU network of the start state, in the units of the state."""
+    middle, half = _scaling(state.space)
+    dense = state.params["params"]
+    layers = [(dense[f"Dense_{i}"]["kernel"].T, dense[f"Dense_{i}"]["bias"]) for i in range(len(dense))]
+    d = middle.shape[0]
+    (first, bias), (last, last_bias) = layers[0], layers[-1]
+    command = jnp.concatenate([(lower - middle) / half, (upper - middle) / half])
+    product = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+    layers[0] = (first[:, :d] / half, bias + product(first[:, d:], command) - product(first[:, :d], middle / half))
+    layers[-1] = (last * half[:, None], last_bias * half + (0.0 if config.residual else middle))
+    return Network(layers=tuple(layers), residual=config.residual)
+
+
+def errors(config: ForwardModelConfig, state: ForwardModelState, batch: Outcome) -> Float[Array, "*N"]:
+    """Squared prediction errors in units of the state, summed over dimensions."""
+    predicted = predict(config, state, batch.start, batch.lower, batch.upper)
+    return jnp.square(predicted - batch.end).sum(axis=-1)
+
+
+def train(
+    config: ForwardModelConfig, state: ForwardModelState, fresh: Outcome, *, key: Array
+) -> tuple[ForwardModelState, Metrics]:
+    """Store the outcomes `fresh` [N] and make `updates_per_epoch` updates on batches of the buffer."""
+    state = state.replace(ring=replay.add(state.ring, fresh))
+
+    def step(carry: tuple, step_key: Array) -> tuple[tuple, Array]:
+        params, optimizer = carry
+        batch = replay.sample(state.ring, step_key, batch_size=config.batch_size)
+        loss, gradient = jax.value_and_grad(partial(_loss, config))(params, state.space, batch)
+        change, optimizer = optax.scale_by_adam().update(gradient, optimizer)
+        params = jax.tree.map(lambda p, c: p - config.learning_rate * c, params, change)
+        return (params, optimizer), loss
+
+    (params, optimizer), losses = jax.lax.scan(
+        step, (state.params, state.optimizer), jax.random.split(key, config.updates_per_epoch)
+    )
+    return state.replace(params=params, optimizer=optimizer), {"loss": losses.mean()}
+
+
+def visited(state: ForwardModelState) -> tuple[Float[Array, "N d"], Float[Array, "N"]]:
+    """Start states in the buffer and a mask of those that are real."""
+    items, written = replay.contents(state.ring)
+    return items.start, items.weight * written
+
+
+def _scaling(space: Float[Array, "2 d"]) -> tuple[Array, Array]:
+    return (space[0] + space[1]) / 2, (space[1] - space[0]) / 2
+
+
+def _predict(config: ForwardModelConfig, params: Any, space: Array, start: Array, lower: Array, upper: Array) -> Array:
+    middle, half = _scaling(space)
+    x = jnp.concatenate([(start - middle) / half, (lower - middle) / half, (upper - middle) / half], axis=-1)
+    out = half * apply(_mlp(config, middle.shape[0]), params, x)
+    return start + out if config.residual else middle + out
+
+
+def _loss(config: ForwardModelConfig, params: Any, space: Array, batch: Outcome) -> Array:
+    predicted = _predict(config, params, space, batch.start, batch.lower, batch.upper)
+    scaled = (predicted - batch.end) / _scaling(space)[1]
+    return jnp.sum(jnp.square(scaled).mean(axis=-1) * batch.weight) / jnp.maximum(batch.weight.sum(), 1.0)

@@ -1,0 +1,238 @@
+"""The hierarchy learns: an epoch is one pure function of the state of a run.
+
+    epoch(state):
+        reset all B environments, clocks at 0
+        repeat episode_length / l times                       # one segment: one decision of the Tutor
+            act (star/episode.py)
+            Controller learns from the segment; where the clock reaches k, Commander learns from the period
+            every `unroll` segments: Tutor learns
+        forward model learns from the epoch's periods; refinement
+
+A period cut short by the end of an episode teaches neither the Commander nor the forward model, because it did not
+last k steps.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from envs.vector import VectorEnv
+from star import abstraction as regions
+from star import commander, controller, episode, forward_model, learner, refinement, tutor
+from star.commander import CommanderState, Decision
+from star.config import AgentConfig
+from star.episode import Episode, Steps, Streams
+from star.forward_model import Outcome
+from star.replay import Transition
+from star.state import Spec, TrainState
+from star.tutor import Trace
+
+Metrics = dict[str, Array]
+
+
+def epoch(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState) -> tuple[TrainState, Metrics]:
+    """One episode of all environments, its updates, one refinement."""
+    key, reset_key, scan_key, end_key = jax.random.split(state.key, 4)
+    streams = episode.start(spec, env, state.abstraction, key=reset_key)
+    blocks = spec.episode_length // (config.tutor.period * config.tutor.unroll)
+    (state, streams), (outcomes, metrics) = jax.lax.scan(
+        partial(_block, config, spec, env), (state.replace(key=key), streams), jax.random.split(scan_key, blocks)
+    )
+    metrics = jax.tree.map(jnp.mean, metrics) | _episode_metrics("train", streams.episode)
+    outcomes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), outcomes)
+    state, more = _learn_between_episodes(config, spec, state, outcomes, env.num_envs, key=end_key)
+    metrics |= more | {"commander/epsilon": commander.epsilon(config.commander, _env_steps(spec, env, state))}
+    return state.replace(epoch=state.epoch + 1), metrics
+
+
+def _block(
+    config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], key: Array
+) -> tuple[tuple[TrainState, Streams], tuple[Any, Metrics]]:
+    """`tutor.unroll` segments, then one update of the Tutor."""
+    scan_key, update_key, relabel_key = jax.random.split(key, 3)
+    carry, (decisions, outcomes, metrics) = jax.lax.scan(
+        partial(_segment, config, spec, env), carry, jax.random.split(scan_key, config.tutor.unroll)
+    )
+    state, streams = carry
+    relabel = _relabel(config, spec, state) if config.tutor.off_policy_correction else None
+    tutor_state, tutor_metrics = learner.update(config.tutor, state.tutor, decisions, relabel=relabel, key=update_key)
+    metrics = jax.tree.map(jnp.mean, metrics) | _prefix("tutor", tutor_metrics)
+    return (state.replace(tutor=tutor_state), streams), (outcomes, metrics)
+
+
+def _segment(
+    config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], key: Array
+) -> tuple[tuple[TrainState, Streams], tuple[Transition, Any, Metrics]]:
+    """One decision of the Tutor: command, act, roll out, let Controller and Commander learn."""
+    state, streams = carry
+    command_key, tutor_key, rollout_key, update_key, reset_key = jax.random.split(key, 5)
+    allowed = episode.successors(config, state)
+    share = commander.epsilon(config.commander, _env_steps(spec, env, state))
+    streams = episode.command(config, spec, state, allowed, streams, epsilon=share, key=command_key)
+
+    subgoal, tutor_action = episode.choose_subgoal(config, spec, state, streams, deterministic=False, key=tutor_key)
+    began = streams.env.obs
+    streams, steps = episode.rollout(config, spec, env, state, streams, subgoal, deterministic=False, key=rollout_key)
+
+    controller_state, controller_metrics = learner.update(
+        config.controller, state.controller, _controller_rollout(config, spec, steps), key=update_key
+    )
+    streams = episode.advance(config, streams, steps)
+    decision, outcome = _finished_period(config, spec, state, streams, steps)
+    commander_state, commander_metrics = commander.update(config.commander, state.commander, allowed, decision)
+    transition = _tutor_transition(config, spec, streams, began, tutor_action, steps)
+    commander_state = commander_state.replace(chosen=commander_state.chosen.at[decision.target].add(decision.weight))
+    metrics = (
+        _prefix("controller", controller_metrics | {"reward": _controller_reward(config, steps)})
+        | _prefix("commander", commander_metrics)
+        | {"tutor/reward": transition.reward.mean(), "env/terminated": (steps.terminated * steps.alive).mean()}
+    )
+    streams = episode.restart_ended(config, env, streams, steps, key=reset_key)
+    state = state.replace(controller=controller_state, commander=commander_state)
+    return (state, streams), (transition, (decision, outcome), metrics)
+
+
+def _learn_between_episodes(
+    config: AgentConfig, spec: Spec, state: TrainState, finished: tuple[Decision, Outcome], num_envs: int, *, key: Array
+) -> tuple[TrainState, Metrics]:
+    """Train the forward model on the epoch's periods and refine the abstraction."""
+    pick_key, train_key = jax.random.split(key)
+    periods = num_envs * (spec.episode_length // config.commander.period)
+    decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
+    error = forward_model.errors(config.forward_model, state.forward_model, outcome)
+    plain = outcome.weight * (decision.target != decision.goal_region)
+    graph = refinement.observe(
+        config, state.graph, region=decision.region, target=decision.target, error=error, weight=plain
+    )
+    model, model_metrics = forward_model.train(config.forward_model, state.forward_model, outcome, key=train_key)
+    state = state.replace(forward_model=model, graph=graph)
+    refine_metrics: Metrics = {}
+    if config.refinement.enabled:
+        state, refine_metrics = _refine(config, state)
+    state = state.replace(commander=state.commander.replace(chosen=0.9 * state.commander.chosen))
+    metrics = (
+        _prefix("forward_model", model_metrics | {"error": jnp.sqrt(_weighted(error, outcome.weight))})
+        | _prefix("refinement", refine_metrics)
+        | {"abstraction/regions": state.abstraction.count}
+    )
+    return state, metrics
+
+
+def _refine(config: AgentConfig, state: TrainState) -> tuple[TrainState, Metrics]:
+    abstraction, graph, splits, metrics = refinement.refine(config, state.abstraction, state.graph, state.forward_model)
+
+    def follow(commander_state: CommanderState, split: refinement.Split) -> tuple[CommanderState, None]:
+        after = commander.on_split(commander_state, parent=split.parent, child=split.child)
+        return regions.where(split.done, after, commander_state), None
+
+    commander_state, _ = jax.lax.scan(follow, state.commander, splits)
+    return state.replace(abstraction=abstraction, graph=graph, commander=commander_state), metrics
+
+
+def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transition:
+    observe = partial(controller.observe, position=spec.abstract_indices)
+    last = jnp.zeros_like(steps.alive).at[-1].set(1.0)
+    return Transition(
+        obs=observe(spec.state(steps.obs), steps.subgoal),
+        action=steps.action,
+        reward=controller.reward(config.controller, steps.subgoal, steps.next_subgoal),
+        next_obs=observe(spec.state(steps.next_obs), steps.next_subgoal),
+        terminated=steps.terminated,
+        cut=jnp.maximum(last, steps.terminated),
+        weight=steps.alive,
+    )
+
+
+def _tutor_transition(
+    config: AgentConfig, spec: Spec, streams: Streams, began: Array, action: Array, steps: Steps
+) -> Transition:
+    """The Tutor's decision at `began`; `streams` stand at the end of its segment, still under its target box."""
+    observe = partial(tutor.observe, config.tutor)
+    path = jnp.concatenate([began[None], steps.next_obs])
+    achieved = spec.abstract(path)
+    distances = jnp.linalg.norm(achieved - streams.box.centre, axis=-1)
+    terminated = jnp.max(steps.terminated * steps.alive, axis=0)
+    extras: Any = ()
+    if config.tutor.off_policy_correction:
+        swap = partial(jnp.swapaxes, axis1=0, axis2=1)
+        extras = Trace(states=swap(spec.state(steps.obs)), actions=swap(steps.action), achieved=swap(achieved))
+    end = steps.next_obs[-1]
+    return Transition(
+        obs=observe(spec.state(began), spec.abstract(began), streams.box),
+        action=action,
+        reward=tutor.reward(config.tutor, distances, steps.alive),
+        next_obs=observe(spec.state(end), spec.abstract(end), streams.box),
+        terminated=terminated,
+        cut=jnp.maximum(streams.clock == 0, terminated),
+        weight=jnp.ones_like(terminated),
+        extras=extras,
+    )
+
+
+def _finished_period(
+    config: AgentConfig, spec: Spec, state: TrainState, streams: Streams, steps: Steps
+) -> tuple[Decision, Outcome]:
+    """The Commander's decisions that came to their end with this segment; weight 0 elsewhere."""
+    end = spec.abstract(steps.next_obs[-1])
+    whole_segment = steps.alive[-1] * (1 - steps.terminated[-1])
+    weight = jnp.where(streams.clock == 0, whole_segment, 0.0)
+    decision = Decision(
+        region=streams.region,
+        goal_region=streams.goal_region,
+        target=streams.target,
+        reward=streams.best,
+        next_region=jax.vmap(partial(regions.locate, state.abstraction))(end),
+        weight=weight,
+    )
+    outcome = Outcome(start=streams.start, lower=streams.box.lower, upper=streams.box.upper, end=end, weight=weight)
+    return decision, outcome
+
+
+def _complete(finished: Any, size: int, *, key: Array) -> Any:
+    """A random `size` of the complete ones among all recorded periods, first by weight."""
+    weight = finished[1].weight
+    order = jnp.argsort(weight + jax.random.uniform(key, weight.shape, maxval=0.5), descending=True)[:size]
+    return jax.tree.map(lambda x: x[order], finished)
+
+
+def _relabel(config: AgentConfig, spec: Spec, state: TrainState) -> Any:
+    """The Tutor's off-policy correction under today's Controller."""
+
+    def mean_action(states: Array, subgoals: Array) -> Array:
+        seen = controller.observe(states, subgoals, position=spec.abstract_indices)
+        return learner.act(config.controller, state.controller, seen, deterministic=True, key=state.key)
+
+    def relabel(batch: Transition, key: Array) -> Transition:
+        return tutor.correct(config.tutor, batch, spec.scale, mean_action, key=key)
+
+    return relabel
+
+
+def _env_steps(spec: Spec, env: VectorEnv, state: TrainState) -> Float[Array, ""]:
+    return state.epoch.astype(jnp.float32) * (spec.episode_length * env.num_envs)
+
+
+def _controller_reward(config: AgentConfig, steps: Steps) -> Array:
+    return _weighted(controller.reward(config.controller, steps.subgoal, steps.next_subgoal), steps.alive)
+
+
+def _episode_metrics(name: str, episode: Episode) -> Metrics:
+    return {
+        f"{name}/success_any": episode.success_any.mean(),
+        f"{name}/success_final": episode.success_final.mean(),
+        f"{name}/distance": episode.distance.mean(),
+        f"{name}/return": episode.total.mean(),
+    }
+
+
+def _weighted(x: Array, weight: Array) -> Array:
+    return jnp.sum(x * weight) / jnp.maximum(weight.sum(), 1.0)
+
+
+def _prefix(level: str, metrics: Metrics) -> Metrics:
+    return {f"{level}/{name}": value for name, value in metrics.items()}

@@ -1,0 +1,92 @@
+"""Sinks of metrics: JSON lines on disk, and a progress bar or plain lines on the terminal."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+
+class JsonLines:
+    """`metrics.jsonl`: one object a line and seed, flushed at once."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def write(self, row: Mapping[str, Any]) -> None:
+        """Append one line; numbers that JSON cannot hold become null."""
+        clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(clean) + "\n")
+
+    def read(self) -> list[dict[str, Any]]:
+        """All complete lines so far."""
+        if not self.path.exists():
+            return []
+        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
+        return [json.loads(line) for line in lines if line.endswith("\n")]
+
+    def keep_until(self, env_steps: int) -> list[dict[str, Any]]:
+        """Drop what was written after `env_steps`, for a run that goes on from there; returns what stays."""
+        rows = [row for row in self.read() if row["env_steps"] <= env_steps]
+        partial = self.path.with_suffix(".partial")
+        partial.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+        os.replace(partial, self.path)
+        return rows
+
+
+class Display:
+    """What a person sees of a run: a live bar on a terminal, one line per evaluation elsewhere."""
+
+    def __init__(self, console: Console, *, total_env_steps: int, done_env_steps: int, quiet: bool = False) -> None:
+        self._console = console
+        self._total = total_env_steps
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[status]}"),
+            TimeRemainingColumn(compact=True),
+            console=console,
+            disable=quiet or not console.is_terminal,
+        )
+        self._quiet = quiet
+        self._task = self._progress.add_task(
+            "compiling", total=total_env_steps, completed=done_env_steps, status="", start=False
+        )
+
+    def __enter__(self) -> Self:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def update(self, env_steps: int, rows: Sequence[Mapping[str, Any]], *, left_s: float) -> None:
+        """Show the rows of one epoch, one per seed."""
+        speed = rows[0]["env_steps_per_s"]
+        regions = mean(rows, "abstraction/regions")
+        status = f"{speed:,.0f} env steps/s  regions {regions:.0f}"
+        success = mean(rows, "eval/success_final")
+        if success is not None:
+            self._success = success
+        if getattr(self, "_success", None) is not None:
+            status += f"  success {self._success:.2f}"
+        self._progress.start_task(self._task)
+        self._progress.update(self._task, completed=env_steps, description="training", status=status)
+        if success is not None and not self._quiet and not self._console.is_terminal:
+            self._console.print(
+                f"{env_steps:,} / {self._total:,} env steps  {status}  {left_s:.0f} s left", highlight=False
+            )
+
+
+def mean(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
+    """Mean of `key` over the rows that have it."""
+    values = [float(row[key]) for row in rows if row.get(key) is not None]
+    return sum(values) / len(values) if values else None

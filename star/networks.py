@@ -1,0 +1,72 @@
+"""Multilayer perceptrons and running normalisation: all the function approximation of the agent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float
+
+
+class MLP(nn.Module):
+    """Dense layers of the widths `hidden`, then a linear layer of width `out`.
+
+    `final_scale` multiplies the initial weights of the last layer: small values start a policy near zero.
+    """
+
+    hidden: Sequence[int]
+    out: int
+    activation: Callable[[Array], Array] = nn.relu
+    final_scale: float = 1.0
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
+        """Apply the network to the last axis of `x`."""
+        # Not orthogonal initialisation: its QR decomposition, batched over seeds, hangs jaxlib 0.10 on CPUs.
+        for width in self.hidden:
+            x = self.activation(nn.Dense(width, kernel_init=nn.initializers.he_normal())(x))
+        small = nn.initializers.variance_scaling(self.final_scale**2, "fan_in", "truncated_normal")
+        return nn.Dense(self.out, kernel_init=small)(x)
+
+
+def apply(mlp: MLP, params: Any, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
+    """Output of `mlp` with `params` for the last axis of `x`."""
+    return jnp.asarray(mlp.apply(params, x))
+
+
+class Normalizer(struct.PyTreeNode):
+    """Running mean and variance of a vector, by the parallel update of Chan, Golub and LeVeque (1979)."""
+
+    mean: Float[Array, "n"]
+    variance: Float[Array, "n"]
+    count: Float[Array, ""]
+
+    @classmethod
+    def create(cls, size: int) -> Normalizer:
+        """Mean 0, variance 1, no data."""
+        return cls(mean=jnp.zeros(size), variance=jnp.ones(size), count=jnp.zeros(()))
+
+    def update(self, batch: Float[Array, "N n"], weight: Float[Array, "N"]) -> Normalizer:
+        """Fold in the rows of `batch` with weight 1; rows with weight 0 do not count."""
+        added = weight.sum()
+        safe = jnp.maximum(added, 1.0)
+        mean = (batch * weight[:, None]).sum(0) / safe
+        variance = (jnp.square(batch - mean) * weight[:, None]).sum(0) / safe
+        total = jnp.maximum(self.count + added, 1.0)
+        delta = mean - self.mean
+        pooled = (
+            self.variance * self.count + variance * added + jnp.square(delta) * self.count * added / total
+        ) / total
+        return Normalizer(
+            mean=self.mean + delta * added / total,
+            variance=jnp.where(added > 0, pooled, self.variance),
+            count=self.count + added,
+        )
+
+    def __call__(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch n"]:
+        """`x` with mean 0 and variance 1, clipped to [-10, 10]."""
+        return jnp.clip((x - self.mean) * jax.lax.rsqrt(self.variance + 1e-4), -10.0, 10.0)

@@ -1,0 +1,201 @@
+"""Proximal policy optimisation (Schulman et al. 2017) on short rollouts of many environments.
+
+    for each of `passes`:                        # over one rollout [T, B], shuffled into minibatches
+        ratio  = pi(a|o) / pi_old(a|o)
+        actor  = -E[min(ratio A, clip(ratio) A)] - entropy H(pi)
+        critic = E[(V(o) - R)^2] / 2
+        the step size grows or shrinks to keep KL(pi_old, pi) near `target_kl`
+
+A and R come from generalised advantage estimation (Schulman et al. 2016); time limits and changes of goal are
+cut, never treated as the end of the task.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from flax.linen import elu
+from jaxtyping import Array, Float
+
+from star.config import PPOConfig
+from star.networks import MLP, Normalizer, apply
+from star.replay import Transition, flatten
+
+Metrics = dict[str, Array]
+
+
+class PPOState(struct.PyTreeNode):
+    """Networks, optimiser, observation statistics and the adaptive step size of one PPO learner."""
+
+    params: Mapping[str, Any]
+    optimizer: optax.OptState
+    normalizer: Normalizer
+    learning_rate: Float[Array, ""]
+
+
+class _Sample(struct.PyTreeNode):
+    obs: Array
+    action: Array
+    log_prob: Array
+    advantage: Array
+    target: Array
+    weight: Array
+
+
+def _actor(config: PPOConfig, action_size: int) -> MLP:
+    return MLP(config.hidden, action_size, elu, final_scale=0.01)
+
+
+def _critic(config: PPOConfig) -> MLP:
+    return MLP(config.hidden, 1, elu)
+
+
+def _optimizer(config: PPOConfig) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
+
+
+def init(key: Array, config: PPOConfig, *, example: Transition) -> PPOState:
+    """A learner for transitions shaped like `example` (no leading axes)."""
+    actor_key, critic_key = jax.random.split(key)
+    (obs_size,), (action_size,) = example.obs.shape, example.action.shape
+    params = {
+        "actor": _actor(config, action_size).init(actor_key, example.obs),
+        "log_std": jnp.full(action_size, jnp.log(config.initial_std), jnp.float32),
+        "critic": _critic(config).init(critic_key, example.obs),
+    }
+    return PPOState(
+        params=params,
+        optimizer=_optimizer(config).init(params),
+        normalizer=Normalizer.create(obs_size),
+        learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
+    )
+
+
+def act(
+    config: PPOConfig, state: PPOState, obs: Float[Array, "*batch obs"], *, deterministic: bool = False, key: Array
+) -> Float[Array, "*batch act"]:
+    """Draw actions from the Gaussian policy, or take its mean. Not clipped to [-1, 1]: the environment does that."""
+    mean, std = _policy(config, state.params, state.normalizer(obs))
+    return mean if deterministic else mean + std * jax.random.normal(key, mean.shape)
+
+
+def update(config: PPOConfig, state: PPOState, rollout: Transition, *, key: Array) -> tuple[PPOState, Metrics]:
+    """Learn from one rollout [T, B] that `state` itself has collected."""
+    samples = _prepare(config, state, rollout)
+
+    def one_pass(carry: tuple, pass_key: Array) -> tuple[tuple, Metrics]:
+        params, optimizer, learning_rate = carry
+        batches = _minibatches(samples, config.minibatches, key=pass_key)
+        (params, optimizer), metrics = jax.lax.scan(
+            partial(_gradient_step, config, learning_rate), (params, optimizer), batches
+        )
+        metrics = jax.tree.map(jnp.mean, metrics)
+        return (params, optimizer, _adapt(config, learning_rate, metrics["kl"])), metrics
+
+    (params, optimizer, learning_rate), metrics = jax.lax.scan(
+        one_pass, (state.params, state.optimizer, state.learning_rate), jax.random.split(key, config.passes)
+    )
+    flat = flatten(rollout)
+    new_state = PPOState(
+        params=params,
+        optimizer=optimizer,
+        normalizer=state.normalizer.update(flat.obs, flat.weight),
+        learning_rate=learning_rate,
+    )
+    metrics = jax.tree.map(jnp.mean, metrics) | {
+        "learning_rate": learning_rate,
+        "std": jnp.exp(params["log_std"]).mean(),
+    }
+    return new_state, metrics
+
+
+def advantages(
+    config: PPOConfig, rollout: Transition, values: Float[Array, "T B"], next_values: Float[Array, "T B"]
+) -> Float[Array, "T B"]:
+    """Generalised advantage estimates, A_t = delta_t + gamma lambda A_{t+1}, with the sum ended at every cut."""
+    bootstrap = config.discount * (1 - rollout.terminated)
+    delta = rollout.reward + bootstrap * next_values - values
+    decay = bootstrap * config.gae_lambda * (1 - rollout.cut)
+
+    def backwards(later: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        advantage = now[0] + now[1] * later
+        return advantage, advantage
+
+    return jax.lax.scan(backwards, jnp.zeros_like(delta[0]), (delta, decay), reverse=True)[1]
+
+
+def _policy(config: PPOConfig, params: Mapping[str, Any], obs: Array) -> tuple[Array, Array]:
+    mean = apply(_actor(config, params["log_std"].shape[0]), params["actor"], obs)
+    return mean, jnp.maximum(jnp.exp(params["log_std"]), config.min_std)
+
+
+def _value(config: PPOConfig, params: Mapping[str, Any], obs: Array) -> Array:
+    return apply(_critic(config), params["critic"], obs)[..., 0]
+
+
+def _log_prob(mean: Array, std: Array, action: Array) -> Array:
+    return jnp.sum(-0.5 * jnp.square((action - mean) / std) - jnp.log(std), axis=-1)
+
+
+def _prepare(config: PPOConfig, state: PPOState, rollout: Transition) -> _Sample:
+    """The rollout as independent samples [T * B], seen through the networks that collected it."""
+    obs, next_obs = state.normalizer(rollout.obs), state.normalizer(rollout.next_obs)
+    values = _value(config, state.params, obs)
+    advantage = advantages(config, rollout, values, _value(config, state.params, next_obs))
+    mean, std = _policy(config, state.params, obs)
+    sample = _Sample(
+        obs=obs,
+        action=rollout.action,
+        log_prob=_log_prob(mean, std, rollout.action),
+        advantage=advantage,
+        target=advantage + values,
+        weight=rollout.weight,
+    )
+    return flatten(sample)
+
+
+def _minibatches(samples: _Sample, count: int, *, key: Array) -> _Sample:
+    order = jax.random.permutation(key, samples.weight.shape[0])
+    return jax.tree.map(lambda x: x[order].reshape(count, -1, *x.shape[1:]), samples)
+
+
+def _gradient_step(config: PPOConfig, learning_rate: Array, carry: tuple, batch: _Sample) -> tuple[tuple, Metrics]:
+    params, optimizer = carry
+    gradient, metrics = jax.grad(partial(_loss, config), has_aux=True)(params, batch)
+    step, optimizer = _optimizer(config).update(gradient, optimizer)
+    params = jax.tree.map(lambda p, s: p - learning_rate * s, params, step)
+    return (params, optimizer), metrics
+
+
+def _loss(config: PPOConfig, params: Mapping[str, Any], batch: _Sample) -> tuple[Array, Metrics]:
+    share = batch.weight / jnp.maximum(batch.weight.sum(), 1.0)
+    centred = batch.advantage - jnp.sum(share * batch.advantage)
+    advantage = centred / (jnp.sqrt(jnp.sum(share * jnp.square(centred))) + 1e-8)
+
+    mean, std = _policy(config, params, batch.obs)
+    log_ratio = _log_prob(mean, std, batch.action) - batch.log_prob
+    ratio = jnp.exp(log_ratio)
+    clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
+    actor_loss = -jnp.sum(share * jnp.minimum(ratio * advantage, clipped * advantage))
+    critic_loss = 0.5 * jnp.sum(share * jnp.square(_value(config, params, batch.obs) - batch.target))
+    entropy = jnp.sum(jnp.log(std)) + 0.5 * std.shape[0] * jnp.log(2 * jnp.pi * jnp.e)
+    metrics = {
+        "actor_loss": actor_loss,
+        "critic_loss": critic_loss,
+        "entropy": entropy,
+        "kl": jnp.sum(share * (ratio - 1 - log_ratio)),
+        "clipped": jnp.sum(share * (jnp.abs(ratio - 1) > config.clip)),
+    }
+    return actor_loss + critic_loss - config.entropy * entropy, metrics
+
+
+def _adapt(config: PPOConfig, learning_rate: Array, kl: Array) -> Array:
+    """Shrink the step size when the policy moved too far in a pass, grow it when it hardly moved."""
+    factor = jnp.where(kl > 2 * config.target_kl, 1 / 1.5, jnp.where(kl < config.target_kl / 2, 1.5, 1.0))
+    return jnp.clip(learning_rate * factor, 1e-5, config.max_learning_rate)

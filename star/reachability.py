@@ -1,0 +1,202 @@
+"""Reachability by abstract interpretation: the part of a box that F_k carries into the target region.
+
+A box is pushed through the forward model as a zonotope {c + sum_i e_i G_i : e in [-1, 1]^m}. Affine layers are
+exact; a ReLU whose input may have either sign is relaxed as in DeepZ (Singh et al. 2018):
+
+    y = lambda x + mu +- mu,   lambda = u / (u - l),   mu = -lambda l / 2        for l < 0 < u
+
+The box hull R of the image gives two shares (STAR, ICLR 2024, section 4.3, after AI2, Gehr et al. 2018):
+c1 = vol(R n G) / vol(R) and c2 = vol(R n G) / vol(G). With c1 >= `reach_share` the box REACHES, with
+c2 <= `miss_share` it MISSES, otherwise it is halved along the dimension of largest smear and each half is judged,
+down to 2^-depth of the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+UNKNOWN, REACHES, MISSES, MIXED = 0, 1, 2, 3
+
+_ROUNDING = 2.0**-23
+
+
+class Network(struct.PyTreeNode):
+    """x -> f(x), or x + f(x) if `residual`; f is made of `layers` (weight [out, in], bias [out]) with ReLU between."""
+
+    layers: Sequence[tuple[Float[Array, "out in"], Float[Array, "out"]]]
+    residual: bool = struct.field(pytree_node=False, default=False)
+
+
+class Zonotope(struct.PyTreeNode):
+    """Centre, generators (one a row) and `slack`: a bound on what float32 rounding may have moved each coordinate."""
+
+    centre: Float[Array, "n"]
+    generators: Float[Array, "m n"]
+    slack: Float[Array, "n"]
+
+    @property
+    def radius(self) -> Float[Array, "n"]:
+        """Half-widths of the box hull."""
+        return jnp.abs(self.generators).sum(axis=0) + self.slack
+
+
+class Leaves(struct.PyTreeNode):
+    """The 2^depth equal parts of an examined box, and whether each was shown to reach the target."""
+
+    lower: Float[Array, "L d"]
+    upper: Float[Array, "L d"]
+    reaches: Bool[Array, "L"]
+
+
+def from_box(lower: Float[Array, "n"], upper: Float[Array, "n"]) -> Zonotope:
+    """The box [lower, upper] as a zonotope with one generator per dimension."""
+    centre = (lower + upper) / 2
+    slack = _ROUNDING * (jnp.abs(lower) + jnp.abs(upper))
+    return Zonotope(centre=centre, generators=jnp.diag((upper - lower) / 2), slack=slack)
+
+
+def affine(z: Zonotope, weight: Float[Array, "out n"], bias: Float[Array, "out"]) -> Zonotope:
+    """Image under x -> W x + b, exact but for rounding, which is bounded."""
+    dot = lambda a, b: jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)  # noqa: E731
+    magnitude = dot(jnp.abs(weight), jnp.abs(z.centre) + z.radius) + jnp.abs(bias)
+    return Zonotope(
+        centre=dot(weight, z.centre) + bias,
+        generators=dot(z.generators, weight.T),
+        slack=dot(jnp.abs(weight), z.slack) + (weight.shape[1] + z.generators.shape[0] + 4) * _ROUNDING * magnitude,
+    )
+
+
+def _add_input(z: Zonotope, box: Zonotope) -> Zonotope:
+    """X + f(x) for the image `z` of `box` under f: they share the first generators, so x does not count twice."""
+    n = box.centre.shape[0]
+    return Zonotope(
+        centre=box.centre + z.centre,
+        generators=z.generators.at[:n].add(box.generators),
+        slack=box.slack + z.slack + 4 * _ROUNDING * (jnp.abs(box.centre) + box.radius + jnp.abs(z.centre) + z.radius),
+    )
+
+
+def relu(z: Zonotope) -> Zonotope:
+    """Smallest-area DeepZ relaxation of max(x, 0); adds one generator per coordinate."""
+    low, high = z.centre - z.radius, z.centre + z.radius
+    crossing = (low < 0) & (high > 0)
+    slope = jnp.where(crossing, high / jnp.where(crossing, high - low, 1.0), (low >= 0).astype(low.dtype))
+    offset = jnp.where(crossing, -slope * low / 2, 0.0)
+    return Zonotope(
+        centre=slope * z.centre + offset,
+        generators=jnp.concatenate([z.generators * slope, jnp.diag(offset)]),
+        slack=slope * z.slack + 4 * _ROUNDING * (jnp.abs(z.centre) + z.radius),
+    )
+
+
+def hull(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) -> tuple[Array, Array]:
+    """Box that contains the image of the box [lower, upper] under `network`."""
+    box = from_box(lower, upper)
+    z = affine(box, *network.layers[0])
+    for weight, bias in network.layers[1:]:
+        z = affine(relu(z), weight, bias)
+    if network.residual:
+        z = _add_input(z, box)
+    return z.centre - z.radius, z.centre + z.radius
+
+
+def smear(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) -> Float[Array, "n"]:
+    """Per input: the sum over outputs of the largest |derivative| in the box, times the box's half-width there."""
+    layers = network.layers
+    z = affine(from_box(lower, upper), *layers[0])
+    low, high = layers[0][0], layers[0][0]
+    for weight, bias in layers[1:]:
+        off = (z.centre + z.radius <= 0)[:, None]
+        surely_on = (z.centre - z.radius >= 0)[:, None]
+        low = jnp.where(surely_on, low, jnp.where(off, 0.0, jnp.minimum(low, 0.0)))
+        high = jnp.where(surely_on, high, jnp.where(off, 0.0, jnp.maximum(high, 0.0)))
+        positive, negative = jnp.maximum(weight, 0.0), jnp.minimum(weight, 0.0)
+        low, high = positive @ low + negative @ high, positive @ high + negative @ low
+        z = affine(relu(z), weight, bias)
+    if network.residual:
+        low, high = low + jnp.eye(low.shape[0]), high + jnp.eye(low.shape[0])
+    return jnp.maximum(jnp.abs(low), jnp.abs(high)).sum(axis=0) * (upper - lower) / 2
+
+
+def shares(
+    lower: Float[Array, "d"], upper: Float[Array, "d"], target: tuple[Float[Array, "d"], Float[Array, "d"]]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """(c1, c2): the shares of the hull and of the target that lie in both.
+
+    Dimensions in which the hull is flat have no volume; there it lies in the target or it does not.
+    """
+    width, target_width = upper - lower, target[1] - target[0]
+    overlap = jnp.maximum(jnp.minimum(upper, target[1]) - jnp.maximum(lower, target[0]), 0.0)
+    flat = width <= 1e-6 * target_width
+    middle = (lower + upper) / 2
+    inside = ((target[0] <= middle) & (middle <= target[1])).astype(width.dtype)
+    c1 = jnp.prod(jnp.where(flat, inside, overlap / jnp.where(flat, 1.0, width)))
+    c2 = jnp.prod(jnp.where(flat, inside, overlap / target_width))
+    return c1, c2
+
+
+def judge(
+    lower: Float[Array, "d"],
+    upper: Float[Array, "d"],
+    target: tuple[Float[Array, "d"], Float[Array, "d"]],
+    *,
+    reach_share: float | Array,
+    miss_share: float | Array,
+) -> Int[Array, ""]:
+    """REACHES, MISSES or UNKNOWN for a hull against a target."""
+    c1, c2 = shares(lower, upper, target)
+    return jnp.where(c1 >= reach_share, REACHES, jnp.where(c2 <= miss_share, MISSES, UNKNOWN))
+
+
+def examine(
+    network: Network,
+    box: tuple[Float[Array, "d"], Float[Array, "d"]],
+    target: tuple[Float[Array, "d"], Float[Array, "d"]],
+    starts: Float[Array, "N d"],
+    seen: Float[Array, "N"],
+    *,
+    depth: int,
+    reach_share: float | Array,
+    miss_share: float | Array,
+    min_visits: int,
+) -> Leaves:
+    """Judge `box` against `target`, halving what is undecided `depth` times.
+
+    `network` maps an abstract state [d] to the abstract state k steps after commanding `target`. A part reaches only
+    if at least `min_visits` of the start states `starts` with mask `seen` lie in it. What stays undecided does not.
+    """
+
+    def visited(lower: Array, upper: Array) -> Bool[Array, ""]:
+        return jnp.sum(jnp.all((lower <= starts) & (starts < upper), axis=-1) * seen) >= min_visits
+
+    def verdict(lower: Array, upper: Array) -> Int[Array, ""]:
+        found = judge(*hull(network, lower, upper), target, reach_share=reach_share, miss_share=miss_share)
+        return jnp.where((found == REACHES) & ~visited(lower, upper), MISSES, found)
+
+    lower, upper = box[0][None], box[1][None]
+    found = jax.vmap(verdict)(lower, upper)
+    for _ in range(depth):
+        lower, upper = jax.vmap(lambda lo, hi: _halve(network, lo, hi))(lower, upper)
+        lower, upper = lower.reshape(-1, lower.shape[-1]), upper.reshape(-1, upper.shape[-1])
+        inherited = jnp.repeat(found, 2)
+        found = jnp.where(inherited == UNKNOWN, jax.vmap(verdict)(lower, upper), inherited)
+    return Leaves(lower=lower, upper=upper, reaches=found == REACHES)
+
+
+def summary(leaves: Leaves) -> Int[Array, ""]:
+    """REACHES if all leaves reach, MISSES if none does, else MIXED."""
+    return jnp.where(leaves.reaches.all(), REACHES, jnp.where(leaves.reaches.any(), MIXED, MISSES))
+
+
+def _halve(network: Network, lower: Float[Array, "d"], upper: Float[Array, "d"]) -> tuple[Array, Array]:
+    """The two halves [2, d] of a box along its dimension of largest smear."""
+    dimension = jnp.argmax(smear(network, lower, upper))
+    middle = (lower[dimension] + upper[dimension]) / 2
+    lowers = jnp.stack([lower, lower.at[dimension].set(middle)])
+    uppers = jnp.stack([upper.at[dimension].set(middle), upper])
+    return lowers, uppers

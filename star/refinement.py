@@ -1,0 +1,256 @@
+"""Refinement: between episodes, look at pairs of regions and cut a region where only a part of it reaches the other.
+
+    a pair (i, j), i != j, is due when
+        it was commanded `min_transitions` times since i or j last changed,
+        it has no verdict, and
+        the forward model's held-out error on it has stopped falling
+    the due pair commanded most is examined (star/reachability.py):
+        all parts of i reach j:  edge i -> j, REACHES
+        none does:               MISSES, for `miss_lifetime` epochs, since the low levels are still learning
+        some do:                 cut i along the axis that best parts the reaching from the missing leaves
+
+Source: STAR (ICLR 2024), section 4.3 and algorithm 2.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from star import abstraction as regions
+from star import forward_model, reachability
+from star.abstraction import Abstraction, Cut
+from star.config import AgentConfig
+from star.forward_model import ForwardModelState
+from star.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves
+
+Metrics = dict[str, Array]
+
+
+class Graph(struct.PyTreeNode):
+    """What is known of every ordered pair of regions (row: start, column: target)."""
+
+    verdict: Int[Array, "R R"]
+    age: Int[Array, "R R"]
+    transitions: Float[Array, "R R"]
+    error: Float[Array, "R R"]
+    stable: Bool[Array, "R R"]
+
+    @property
+    def reaches(self) -> Bool[Array, "R R"]:
+        """Edges: pairs shown reachable."""
+        return self.verdict == REACHES
+
+    @property
+    def misses(self) -> Bool[Array, "R R"]:
+        """Pairs shown unreachable, and not yet forgotten."""
+        return self.verdict == MISSES
+
+
+def init(*, capacity: int) -> Graph:
+    """Nothing known."""
+    square = (capacity, capacity)
+    return Graph(
+        verdict=jnp.full(square, UNKNOWN, jnp.int32),
+        age=jnp.zeros(square, jnp.int32),
+        transitions=jnp.zeros(square),
+        error=jnp.full(square, jnp.inf, jnp.float32),
+        stable=jnp.zeros(square, bool),
+    )
+
+
+def observe(
+    config: AgentConfig,
+    graph: Graph,
+    *,
+    region: Int[Array, "N"],
+    target: Int[Array, "N"],
+    error: Float[Array, "N"],
+    weight: Float[Array, "N"],
+) -> Graph:
+    """Count one epoch's transitions and compare the forward model's error on them, per pair, with the epoch before."""
+    cell = (region, target)
+    seen = jnp.zeros_like(graph.transitions).at[cell].add(weight)
+    mean = jnp.zeros_like(graph.error).at[cell].add(weight * error) / jnp.maximum(seen, 1.0)
+    falling = mean < (1 - config.refinement.error_tolerance) * graph.error
+    return graph.replace(
+        transitions=graph.transitions + seen,
+        error=jnp.where(seen > 0, mean, graph.error),
+        stable=jnp.where(seen > 0, ~falling, graph.stable),
+    )
+
+
+def forget(config: AgentConfig, graph: Graph) -> Graph:
+    """Let one epoch pass: MISSES verdicts older than `miss_lifetime` become unknown and must earn examination anew."""
+    age = graph.age + 1
+    expired = graph.misses & (age > config.refinement.miss_lifetime)
+    return graph.replace(
+        age=age,
+        verdict=jnp.where(expired, UNKNOWN, graph.verdict),
+        transitions=jnp.where(expired, 0.0, graph.transitions),
+    )
+
+
+def due(config: AgentConfig, graph: Graph, active: Bool[Array, "R"]) -> Bool[Array, "R R"]:
+    """The pairs that pass the gate."""
+    off_diagonal = ~jnp.eye(active.shape[0], dtype=bool)
+    pairs = active[:, None] & active[None, :] & off_diagonal
+    commanded = graph.transitions >= config.refinement.min_transitions
+    return pairs & commanded & graph.stable & (graph.verdict == UNKNOWN)
+
+
+def best_cut(
+    abstraction: Abstraction, candidates: Bool[Array, "R"], leaves: Leaves, *, min_width: float | Array
+) -> tuple[Cut, Float[Array, ""]]:
+    """The cut of one of the `candidates` that best parts reaching from missing leaves, and what it gains.
+
+    The gain is the decrease of Gini impurity, as in a decision tree: the impurity of a part with volume v, of which r
+    reaches, is r (v - r) / v; it is given as a share of the volume of all leaves. Cuts lie on leaf boundaries and
+    leave both parts at least `min_width` wide.
+    """
+    positions = leaves.upper.T
+    volume = jnp.prod(leaves.upper - leaves.lower, axis=-1)
+
+    def overlap(lower: Array, upper: Array) -> Float[Array, "L"]:
+        inside = jnp.minimum(upper, leaves.upper) - jnp.maximum(lower, leaves.lower)
+        return jnp.prod(jnp.maximum(inside, 0.0), axis=-1)
+
+    def impurity(part: Float[Array, "L"]) -> Array:
+        reaching, missing = jnp.sum(part * leaves.reaches), jnp.sum(part * ~leaves.reaches)
+        return reaching * missing / jnp.maximum(reaching + missing, 1e-12)
+
+    def gain(region: Array, dimension: Array, position: Array) -> Array:
+        lower, upper = abstraction.lower[region], abstraction.upper[region]
+        wide = (position - lower[dimension] >= min_width) & (upper[dimension] - position >= min_width)
+        below = overlap(lower, upper.at[dimension].set(jnp.minimum(position, upper[dimension])))
+        whole = overlap(lower, upper)
+        decrease = impurity(whole) - impurity(below) - impurity(whole - below)
+        return jnp.where(wide & candidates[region], decrease / volume.sum(), 0.0)
+
+    d, count = positions.shape
+    every_region, every_dimension = jnp.arange(abstraction.capacity), jnp.arange(d)
+    over_positions = jax.vmap(gain, in_axes=(None, None, 0))
+    over_dimensions = jax.vmap(over_positions, in_axes=(None, 0, 0))
+    gains = jax.vmap(over_dimensions, in_axes=(0, None, None))(every_region, every_dimension, positions)
+    best = jnp.argmax(gains)
+    region, dimension, index = jnp.unravel_index(best, (abstraction.capacity, d, count))
+    return Cut(region=region, dimension=dimension, position=positions[dimension, index]), gains.reshape(-1)[best]
+
+
+class Split(struct.PyTreeNode):
+    """A cut that was made (`done`) or not: the region it cut and the region that is new."""
+
+    done: Bool[Array, ""]
+    parent: Int[Array, ""]
+    child: Int[Array, ""]
+
+
+def refine(
+    config: AgentConfig, abstraction: Abstraction, graph: Graph, model: ForwardModelState
+) -> tuple[Abstraction, Graph, Split, Metrics]:
+    """Examine the due pairs of one epoch, at most `pairs_per_epoch`, and cut where a verdict is mixed.
+
+    Returns the splits in the order made, stacked [pairs_per_epoch * cuts_per_pair], for tables indexed by region.
+    """
+    graph = forget(config, graph)
+    starts, seen = forward_model.visited(model)
+
+    def one_pair(carry: tuple[Abstraction, Graph], _: None) -> tuple[tuple[Abstraction, Graph], tuple]:
+        abstraction, graph = carry
+        waiting = due(config, graph, abstraction.active)
+        region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, graph.transitions, -1.0)), waiting.shape)
+        found = waiting[region, target]
+        leaves = _examine(config, abstraction, model, region, target, starts, seen)
+        verdict = reachability.summary(leaves)
+        settled = found & (verdict != MIXED)
+        graph = graph.replace(
+            verdict=graph.verdict.at[region, target].set(jnp.where(settled, verdict, graph.verdict[region, target])),
+            age=graph.age.at[region, target].set(jnp.where(found, 0, graph.age[region, target])),
+            transitions=graph.transitions.at[region, target].multiply(jnp.where(found, 0.0, 1.0)),
+        )
+        mixed = found & (verdict == MIXED)
+        abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed)
+        return (abstraction, graph), (splits, found, mixed)
+
+    (abstraction, graph), (splits, found, mixed) = jax.lax.scan(
+        one_pair, (abstraction, graph), None, length=config.refinement.pairs_per_epoch
+    )
+    splits = jax.tree.map(lambda x: x.reshape(-1), splits)
+    metrics = {
+        "examined": found.sum(),
+        "mixed": mixed.sum(),
+        "splits": splits.done.sum(),
+        "edges": graph.reaches.sum(),
+        "misses": graph.misses.sum(),
+        "table_full": (abstraction.count == abstraction.capacity).astype(jnp.int32),
+    }
+    return abstraction, graph, splits, metrics
+
+
+def on_split(graph: Graph, split: Split) -> Graph:
+    """Parts of a region inherit what held for all of it as a start; as targets they are new, so nothing is known."""
+    inherit = partial(regions.inherit, parent=split.parent, child=split.child, axes=(0,))
+    old = graph
+    graph = jax.tree.map(inherit, graph)
+    changed = jnp.zeros(graph.verdict.shape[0], bool).at[jnp.array([split.parent, split.child])].set(True)
+    either = changed[:, None] | changed[None, :]
+    fresh = init(capacity=graph.verdict.shape[0])
+    graph = graph.replace(
+        verdict=jnp.where(changed[None, :], UNKNOWN, graph.verdict),
+        transitions=jnp.where(either, 0.0, graph.transitions),
+        error=jnp.where(either, fresh.error, graph.error),
+        stable=graph.stable & ~either,
+    )
+    return regions.where(split.done, graph, old)
+
+
+def _examine(
+    config: AgentConfig,
+    abstraction: Abstraction,
+    model: ForwardModelState,
+    region: Array,
+    target: Array,
+    starts: Array,
+    seen: Array,
+) -> Leaves:
+    goal = (abstraction.lower[target], abstraction.upper[target])
+    return reachability.examine(
+        forward_model.network(config.forward_model, model, *goal),
+        (abstraction.lower[region], abstraction.upper[region]),
+        goal,
+        starts,
+        seen,
+        depth=config.refinement.depth,
+        reach_share=config.refinement.reach_share,
+        miss_share=config.refinement.miss_share,
+        min_visits=config.refinement.min_visits,
+    )
+
+
+def _cut(
+    config: AgentConfig, abstraction: Abstraction, graph: Graph, region: Array, leaves: Leaves, mixed: Array
+) -> tuple[Abstraction, Graph, Split]:
+    """Up to `cuts_per_pair` cuts of `region` and of the parts cut from it, best first."""
+
+    def one_cut(carry: tuple, _: None) -> tuple[tuple, Split]:
+        abstraction, graph, parts = carry
+        min_width = config.abstraction.min_width
+        cut, gain = best_cut(abstraction, parts, leaves, min_width=min_width)
+        child = abstraction.count
+        after, possible = regions.split(abstraction, cut, min_width=min_width)
+        split = Split(
+            done=mixed & possible & (gain > 1e-6), parent=cut.region, child=jnp.minimum(child, parts.shape[0] - 1)
+        )
+        abstraction = regions.where(split.done, after, abstraction)
+        parts = parts.at[split.child].set(parts[split.child] | split.done)
+        return (abstraction, on_split(graph, split), parts), split
+
+    parts = jnp.zeros(abstraction.capacity, bool).at[region].set(True)
+    (abstraction, graph, _), splits = jax.lax.scan(
+        one_cut, (abstraction, graph, parts), None, length=config.refinement.cuts_per_pair
+    )
+    return abstraction, graph, splits

@@ -1,0 +1,151 @@
+"""The state of a run: one pytree, and what its levels know of the environment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from star import abstraction as regions
+from star import commander, controller, forward_model, learner, refinement
+from star.abstraction import Abstraction
+from star.commander import CommanderState
+from star.config import AgentConfig, Config
+from star.forward_model import ForwardModelState
+from star.refinement import Graph
+from star.replay import Transition
+from star.tutor import Trace
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What the levels know of the environment."""
+
+    state_dim: int
+    action_size: int
+    episode_length: int
+    abstract_indices: tuple[int, ...]
+    goal_indices: tuple[int, ...]
+    subgoal_scale: tuple[float, ...]
+    space: tuple[tuple[float, ...], tuple[float, ...]]
+    region_cuts: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(cls, env: Any) -> Spec:
+        """Read the spec off an environment of `envs.make`."""
+        return cls(
+            state_dim=env.state_dim,
+            action_size=env.action_size,
+            episode_length=env.episode_length,
+            abstract_indices=tuple(env.abstract_indices),
+            goal_indices=tuple(env.goal_indices),
+            subgoal_scale=tuple(env.subgoal_scale),
+            space=(tuple(map(float, env.space[0])), tuple(map(float, env.space[1]))),
+            region_cuts=tuple(tuple(cut) for cut in env.region_cuts),
+        )
+
+    @property
+    def scale(self) -> Float[Array, "d"]:
+        """Half-ranges of the Tutor's subgoals."""
+        return jnp.asarray(self.subgoal_scale)
+
+    def state(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch state"]:
+        """The state part of an observation."""
+        return obs[..., : self.state_dim]
+
+    def goal(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch goal"]:
+        """The task goal g* in an observation."""
+        return obs[..., self.state_dim :]
+
+    def abstract(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch d"]:
+        """The abstract dimensions of an observation."""
+        return obs[..., np.asarray(self.abstract_indices)]
+
+    def goal_point(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch d"]:
+        """g* as an abstract point; abstract dimensions that g* leaves open are those of the state."""
+        columns = [
+            self.goal(obs)[..., self.goal_indices.index(i)] if i in self.goal_indices else obs[..., i]
+            for i in self.abstract_indices
+        ]
+        return jnp.stack(columns, axis=-1)
+
+    def in_goal(self) -> Bool[Array, "d"]:
+        """Which abstract dimensions g* fixes."""
+        return jnp.asarray([i in self.goal_indices for i in self.abstract_indices])
+
+
+class TrainState(struct.PyTreeNode):
+    """Everything a run knows between two epochs. Environments are reset by every epoch, so they are not part of it."""
+
+    commander: CommanderState
+    tutor: learner.State
+    controller: learner.State
+    abstraction: Abstraction
+    graph: Graph
+    forward_model: ForwardModelState
+    epoch: Int[Array, ""]
+    key: Array
+
+
+def init(config: AgentConfig, spec: Spec, *, key: Array) -> TrainState:
+    """A fresh run."""
+    tutor_key, controller_key, model_key, key = jax.random.split(key, 4)
+    cuts = spec.region_cuts if config.abstraction.cuts is None else config.abstraction.cuts
+    abstraction = regions.create(spec.space, cuts, max_regions=config.abstraction.max_regions)
+    tutor_example, controller_example = _examples(config, spec)
+    return TrainState(
+        commander=commander.init(regions=abstraction.capacity),
+        tutor=learner.init(tutor_key, config.tutor, example=tutor_example),
+        controller=learner.init(controller_key, config.controller, example=controller_example),
+        abstraction=abstraction,
+        graph=refinement.init(capacity=abstraction.capacity),
+        forward_model=forward_model.init(model_key, config.forward_model, space=abstraction.space),
+        epoch=jnp.zeros((), jnp.int32),
+        key=key,
+    )
+
+
+def check(config: Config, spec: Spec) -> None:
+    """Raise ValueError with one line if `config` does not fit the environment."""
+    segments, rest = divmod(spec.episode_length, config.tutor.period)
+    if rest:
+        raise ValueError(f"tutor.period: {config.tutor.period} does not divide the episode of {spec.episode_length}")
+    if segments % config.tutor.unroll:
+        raise ValueError(f"tutor.unroll: {config.tutor.unroll} does not divide the {segments} decisions of an episode")
+    if config.commander.period > spec.episode_length:
+        raise ValueError(f"commander.period: {config.commander.period} exceeds the episode of {spec.episode_length}")
+    for name, section, decisions in (
+        ("tutor", config.tutor, config.tutor.unroll),
+        ("controller", config.controller, config.tutor.period),
+    ):
+        rollout = decisions * config.trainer.num_envs
+        if section.learner == "td3" and section.td3.buffer_size < rollout:
+            raise ValueError(f"{name}.td3.buffer_size: {section.td3.buffer_size} is below one rollout of {rollout}")
+    cuts = spec.region_cuts if config.abstraction.cuts is None else config.abstraction.cuts
+    try:
+        regions.create(spec.space, cuts, max_regions=config.abstraction.max_regions)
+    except ValueError as error:
+        raise ValueError(f"abstraction.cuts: {error}") from None
+
+
+def _examples(config: AgentConfig, spec: Spec) -> tuple[Transition, Transition]:
+    """Shapes of one transition of Tutor and Controller."""
+    d, l, scalar = len(spec.abstract_indices), config.tutor.period, jnp.zeros(())
+    rest = {"reward": scalar, "terminated": scalar, "cut": scalar, "weight": scalar}
+    seen_by_tutor = jnp.zeros(spec.state_dim + 2 * d)
+    trace = Trace(
+        states=jnp.zeros((l, spec.state_dim)),
+        actions=jnp.zeros((l, spec.action_size)),
+        achieved=jnp.zeros((l + 1, d)),
+    )
+    extras = trace if config.tutor.off_policy_correction else ()
+    seen_by_controller = controller.observe(jnp.zeros(spec.state_dim), jnp.zeros(d), position=spec.abstract_indices)
+    return (
+        Transition(obs=seen_by_tutor, action=jnp.zeros(d), next_obs=seen_by_tutor, extras=extras, **rest),
+        Transition(obs=seen_by_controller, action=jnp.zeros(spec.action_size), next_obs=seen_by_controller, **rest),
+    )

@@ -1,0 +1,164 @@
+"""Twin delayed DDPG (Fujimoto, van Hoof and Meger 2018): the published learner of Tutor and Controller.
+
+    y      = r + gamma (1 - terminated) min_i Q'_i(o', pi'(o') + clipped noise)
+    critic = sum_i E[(Q_i(o, a) - y)^2]
+    actor  = -E[Q_1(o, pi(o))]                   # every `policy_delay` critic updates
+    targets follow with rate tau
+
+Every rollout enters the replay buffer, then `updates_per_rollout` batches are drawn from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from star import replay
+from star.config import TD3Config
+from star.networks import MLP, apply
+from star.replay import Transition, flatten
+
+Metrics = dict[str, Array]
+Relabel = Callable[[Transition, Array], Transition]
+
+
+class TD3State(struct.PyTreeNode):
+    """Networks with their targets, two optimisers and the replay buffer of one TD3 learner."""
+
+    params: Mapping[str, Any]
+    target: Mapping[str, Any]
+    actor_optimizer: optax.OptState
+    critic_optimizer: optax.OptState
+    ring: replay.Ring
+    updates: Int[Array, ""]
+
+
+def _actor(config: TD3Config, action_size: int) -> MLP:
+    return MLP(config.hidden, action_size, final_scale=0.01)
+
+
+def _q(config: TD3Config, params: Any, obs: Array, action: Array) -> Float[Array, "2 * batch"]:
+    """Both critics; their parameters are stacked on a leading axis."""
+    x = jnp.concatenate([obs, action], axis=-1)
+    return jax.vmap(lambda one: apply(MLP(config.hidden, 1), one, x)[..., 0])(params)
+
+
+def _policy(config: TD3Config, params: Any, obs: Array, action_size: int) -> Array:
+    return jnp.tanh(apply(_actor(config, action_size), params, obs))
+
+
+def init(key: Array, config: TD3Config, *, example: Transition) -> TD3State:
+    """A learner for transitions shaped like `example` (no leading axes)."""
+    actor_key, critic_key = jax.random.split(key)
+    (action_size,) = example.action.shape
+    both = jnp.concatenate([example.obs, example.action])
+    params = {
+        "actor": _actor(config, action_size).init(actor_key, example.obs),
+        "critic": jax.vmap(lambda k: MLP(config.hidden, 1).init(k, both))(jax.random.split(critic_key)),
+    }
+    adam = optax.scale_by_adam()
+    return TD3State(
+        params=params,
+        target=jax.tree.map(jnp.copy, params),
+        actor_optimizer=adam.init(params["actor"]),
+        critic_optimizer=adam.init(params["critic"]),
+        ring=replay.create(example, size=config.buffer_size),
+        updates=jnp.zeros((), jnp.int32),
+    )
+
+
+def act(
+    config: TD3Config, state: TD3State, obs: Float[Array, "*batch obs"], *, deterministic: bool = False, key: Array
+) -> Float[Array, "*batch act"]:
+    """Actions in [-1, 1], with Gaussian exploration noise unless `deterministic`."""
+    action = _policy(config, state.params["actor"], obs, _action_size(state))
+    if deterministic:
+        return action
+    return jnp.clip(action + config.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
+
+
+def update(
+    config: TD3Config, state: TD3State, rollout: Transition, *, relabel: Relabel | None = None, key: Array
+) -> tuple[TD3State, Metrics]:
+    """Store one rollout [T, B] and make `updates_per_rollout` updates, on batches passed through `relabel`."""
+    state = state.replace(ring=replay.add(state.ring, flatten(rollout)))
+    state, metrics = jax.lax.scan(
+        partial(_one_update, config, relabel), state, jax.random.split(key, config.updates_per_rollout)
+    )
+    return state, jax.tree.map(jnp.mean, metrics)
+
+
+def _one_update(config: TD3Config, relabel: Relabel | None, state: TD3State, key: Array) -> tuple[TD3State, Metrics]:
+    sample_key, noise_key, relabel_key = jax.random.split(key, 3)
+    batch = replay.sample(state.ring, sample_key, batch_size=config.batch_size)
+    if relabel is not None:
+        batch = relabel(batch, relabel_key)
+    ready = replay.filled(state.ring) >= min(config.min_transitions, replay.capacity(state.ring))
+    act_too = ready & (state.updates % config.policy_delay == 0)
+
+    critic_grad, critic_metrics = jax.grad(partial(_critic_loss, config), has_aux=True)(
+        state.params["critic"], state.target, batch, noise_key
+    )
+    critic, critic_optimizer = _adam_step(
+        state.params["critic"], critic_grad, state.critic_optimizer, config.critic_learning_rate, ready
+    )
+    actor_grad, actor_metrics = jax.grad(partial(_actor_loss, config), has_aux=True)(
+        state.params["actor"], critic, batch
+    )
+    actor, actor_optimizer = _adam_step(
+        state.params["actor"], actor_grad, state.actor_optimizer, config.actor_learning_rate, act_too
+    )
+    params = {"actor": actor, "critic": critic}
+    rate = config.tau * act_too
+    return (
+        state.replace(
+            params=params,
+            target=jax.tree.map(lambda t, p: t + rate * (p - t), state.target, params),
+            actor_optimizer=actor_optimizer,
+            critic_optimizer=critic_optimizer,
+            updates=state.updates + ready.astype(jnp.int32),
+        ),
+        critic_metrics | actor_metrics,
+    )
+
+
+def _critic_loss(config: TD3Config, params: Any, target: Any, batch: Transition, key: Array) -> tuple[Array, Metrics]:
+    noise = config.target_noise * jax.random.normal(key, batch.action.shape)
+    noise = jnp.clip(noise, -config.target_noise_clip, config.target_noise_clip)
+    next_action = _policy(config, target["actor"], batch.next_obs, batch.action.shape[-1])
+    next_q = _q(config, target["critic"], batch.next_obs, jnp.clip(next_action + noise, -1.0, 1.0)).min(axis=0)
+    goal = batch.reward + config.discount * (1 - batch.terminated) * next_q
+    q = _q(config, params, batch.obs, batch.action)
+    loss = _mean(jnp.square(q - goal).sum(axis=0), batch.weight)
+    return loss, {"critic_loss": loss, "q": _mean(q[0], batch.weight)}
+
+
+def _actor_loss(config: TD3Config, params: Any, critic: Any, batch: Transition) -> tuple[Array, Metrics]:
+    action = _policy(config, params, batch.obs, batch.action.shape[-1])
+    loss = -_mean(_q(config, critic, batch.obs, action)[0], batch.weight)
+    return loss, {"actor_loss": loss}
+
+
+def _adam_step(
+    params: Any, gradient: Any, optimizer: optax.OptState, learning_rate: float | Array, enabled: Array
+) -> tuple[Any, optax.OptState]:
+    """One Adam step, or nothing at all where `enabled` is false."""
+    step, stepped = optax.scale_by_adam().update(gradient, optimizer)
+    params = jax.tree.map(lambda p, s: p - jnp.where(enabled, learning_rate * s, 0.0), params, step)
+    return params, jax.tree.map(lambda new, old: jnp.where(enabled, new, old), stepped, optimizer)
+
+
+def _mean(x: Array, weight: Array) -> Array:
+    return jnp.sum(x * weight) / jnp.maximum(weight.sum(), 1.0)
+
+
+def _action_size(state: TD3State) -> int:
+    layers = state.params["actor"]["params"]
+    return layers[f"Dense_{len(layers) - 1}"]["bias"].shape[-1]

@@ -1,0 +1,299 @@
+"""The host's side of a run: epochs, evaluation, checkpoints, metrics and the figure, around one jitted function."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+import envs
+from envs.vector import VectorEnv
+from star import episode, evaluation, hierarchy, report
+from star import state as states
+from star.checkpoint import Checkpoints, check_compatible
+from star.config import Config, ConfigError, parse
+from star.episode import Episode
+from star.metrics import Display, JsonLines, mean
+from star.state import Spec, TrainState
+
+_EVALUATION_SEED = 1_000_003
+
+
+@dataclass(frozen=True)
+class Program:
+    """The compiled parts of a run. States and keys carry a leading axis of seeds."""
+
+    config: Config
+    spec: Spec
+    walls: np.ndarray
+    init: Callable[[jax.Array], TrainState]
+    epoch: Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
+    evaluate: Callable[[TrainState, jax.Array], Episode]
+
+    @property
+    def env_steps_per_epoch(self) -> int:
+        """Env steps of all environments of one seed in one epoch."""
+        return self.config.trainer.num_envs * self.spec.episode_length
+
+    @property
+    def epochs(self) -> int:
+        """Epochs that make up at least `total_env_steps`."""
+        return -(-self.config.trainer.total_env_steps // self.env_steps_per_epoch)
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds trained side by side."""
+        first = self.config.trainer.seed
+        return list(range(first, first + self.config.trainer.num_seeds))
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a call of `train` ended."""
+
+    run_dir: Path
+    env_steps: int
+    interrupted: bool
+    success_final: float | None
+
+
+def build(config: Config) -> Program:
+    """Make the environments and the jitted functions of `config`; raises `ConfigError` if they cannot be made."""
+    select_device(config.trainer.device)
+    env = _make_env(config, "train")
+    spec = Spec.of(env)
+    config = _resolve(config, env.engine, spec)
+    try:
+        states.check(config, spec)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    agent = config.agent()
+    trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
+    tested = VectorEnv(_make_env(config, "test"), config.trainer.eval_episodes, auto_reset=False)
+
+    def epoch(agent: Any, state: TrainState) -> Any:
+        return jax.vmap(partial(hierarchy.epoch, agent, spec, trained))(state)
+
+    def evaluate(agent: Any, state: TrainState, keys: jax.Array) -> Any:
+        return jax.vmap(lambda one, key: episode.evaluate(agent, spec, tested, one, key=key))(state, keys)
+
+    jitted_epoch, jitted_evaluate = jax.jit(epoch, donate_argnums=1), jax.jit(evaluate)
+    init = jax.jit(lambda agent, keys: jax.vmap(lambda key: states.init(agent, spec, key=key))(keys))
+    return Program(
+        config=config,
+        spec=spec,
+        walls=np.asarray(env.arena.walls()),
+        init=lambda keys: init(agent, keys),
+        epoch=lambda state: jitted_epoch(agent, state),
+        evaluate=lambda state, keys: jitted_evaluate(agent, state, keys),
+    )
+
+
+def train(
+    config: Config, run_dir: Path, *, resume: bool = False, quiet: bool = False, console: Console | None = None
+) -> Result:
+    """Train to the end, or go on with the run in `run_dir`. Ctrl-C writes a checkpoint and returns."""
+    console = console or Console(stderr=True)
+    program = build(config)
+    checkpoints = Checkpoints(run_dir, keep=config.trainer.keep_checkpoints)
+    sink = JsonLines(run_dir / "metrics.jsonl")
+    if resume:
+        state, rows = _restore(program, checkpoints, sink)
+    else:
+        _prepare(run_dir, program.config)
+        state, rows = program.init(_seed_keys(program)), []
+    try:
+        return _loop(program, state, rows, run_dir, checkpoints, sink, quiet=quiet, console=console)
+    finally:
+        checkpoints.close()
+
+
+def evaluate(config: Config, run_dir: Path, *, checkpoint: str = "last", seed: int = 0) -> dict[str, Any]:
+    """Evaluate a checkpoint of `run_dir`: "last", "best" or its env steps. Statistics per seed and over all."""
+    program = build(config)
+    checkpoints = Checkpoints(run_dir)
+    try:
+        step = _choose(checkpoints, run_dir, checkpoint)
+        check_compatible(checkpoints.config(step), program.config, source=run_dir)
+        state = checkpoints.restore(step, jax.eval_shape(program.init, _seed_keys(program)))
+    finally:
+        checkpoints.close()
+    # Epochs count from 1, so these goals and starts are none that training was evaluated on.
+    episodes = jax.device_get(program.evaluate(state, evaluation_keys(program, -1 - seed)))
+    per_seed = [
+        {"seed": name} | evaluation.summarise(jax.tree.map(lambda x, i=i: x[i], episodes))
+        for i, name in enumerate(program.seeds)
+    ]
+    about = {"run": str(run_dir), "env": config.env.name, "engine": program.config.env.engine, "env_steps": step}
+    return about | evaluation.summarise(episodes) | {"seeds": per_seed}
+
+
+def evaluation_keys(program: Program, epoch: int) -> jax.Array:
+    """Keys of the evaluation after `epoch`, one per seed, apart from all keys of training."""
+    base = jax.random.fold_in(jax.random.key(_EVALUATION_SEED), epoch)
+    return jax.vmap(partial(jax.random.fold_in, base))(np.asarray(program.seeds))
+
+
+def select_device(device: str) -> None:
+    """Make JAX use the device that `trainer.device` asks for; raises `ConfigError` if there is none."""
+    if device == "cpu":
+        jax.config.update("jax_platforms", "cpu")
+    if device == "gpu" and jax.default_backend() != "gpu":
+        raise ConfigError(
+            f"trainer.device: 'gpu' is not available, JAX sees only {jax.default_backend()}; "
+            'install with pip install "star-rl[cuda,warp]" on a machine with an NVIDIA GPU, or use auto or cpu'
+        )
+
+
+def _loop(
+    program: Program,
+    state: TrainState,
+    rows: list[dict[str, Any]],
+    run_dir: Path,
+    checkpoints: Checkpoints,
+    sink: JsonLines,
+    *,
+    quiet: bool,
+    console: Console,
+) -> Result:
+    config, seeds = program.config.trainer, program.seeds
+    done = int(state.epoch[0])
+    began = time.monotonic() - (rows[-1]["wall_s"] if rows else 0.0)
+    success = _latest_success(rows)
+    saved = done if checkpoints.steps() else -1
+    display = Display(
+        console,
+        total_env_steps=program.epochs * program.env_steps_per_epoch,
+        done_env_steps=done * program.env_steps_per_epoch,
+        quiet=quiet,
+    )
+    with display, _interruptible() as interrupted:
+        while done < program.epochs and not interrupted():
+            epoch_began = time.monotonic()
+            state, metrics = program.epoch(state)
+            table = _rows(metrics, seeds)
+            speed = program.env_steps_per_epoch * len(seeds) / (time.monotonic() - epoch_began)
+            done += 1
+            if done % config.eval_every == 0 or done == program.epochs:
+                _add_evaluation(table, program.evaluate(state, evaluation_keys(program, done)))
+                success = mean(table, "eval/success_final")
+            env_steps = done * program.env_steps_per_epoch
+            for row in table:
+                row |= {"env_steps": env_steps, "wall_s": round(time.monotonic() - began, 3)}
+                row |= {"env_steps_per_s": round(speed)}
+                sink.write(row)
+            rows.extend(table)
+            display.update(env_steps, table, left_s=(program.epochs - done) * (time.monotonic() - epoch_began))
+            if done % config.checkpoint_every == 0 or done == program.epochs:
+                checkpoints.save(env_steps, state, program.config, success=_or_zero(success))
+                saved = done
+        stopped = done < program.epochs
+        if saved != done:
+            checkpoints.save(done * program.env_steps_per_epoch, state, program.config, success=_or_zero(success))
+    report.summary_figure(run_dir / "figures" / "summary.png", state=state, rows=rows, walls=program.walls, seeds=seeds)
+    return Result(run_dir, done * program.env_steps_per_epoch, stopped, success)
+
+
+def _rows(metrics: dict[str, jax.Array], seeds: list[int]) -> list[dict[str, Any]]:
+    """One row per seed of the metrics of an epoch."""
+    host = jax.device_get(metrics)
+    return [{"seed": seed} | {k: v[i].item() for k, v in host.items()} for i, seed in enumerate(seeds)]
+
+
+def _add_evaluation(table: list[dict[str, Any]], episodes: Episode) -> None:
+    host = jax.device_get(episodes)
+    for i, row in enumerate(table):
+        summary = evaluation.summarise(jax.tree.map(lambda x, i=i: x[i], host))
+        row |= {f"eval/{name}": summary[name] for name in ("success_any", "success_final", "distance", "return")}
+
+
+def _latest_success(rows: list[dict[str, Any]]) -> float | None:
+    steps = [row["env_steps"] for row in rows if "eval/success_final" in row]
+    return mean([row for row in rows if row["env_steps"] == steps[-1]], "eval/success_final") if steps else None
+
+
+def _or_zero(success: float | None) -> float:
+    return 0.0 if success is None else success
+
+
+def _restore(program: Program, checkpoints: Checkpoints, sink: JsonLines) -> tuple[TrainState, list[dict[str, Any]]]:
+    steps = checkpoints.steps()
+    if not steps:
+        raise ConfigError(f"{sink.path.parent}: holds no checkpoint to resume from")
+    check_compatible(checkpoints.config(steps[-1]), program.config, source=sink.path.parent)
+    example = jax.eval_shape(program.init, _seed_keys(program))
+    return checkpoints.restore(steps[-1], example), sink.keep_until(steps[-1])
+
+
+def _choose(checkpoints: Checkpoints, run_dir: Path, wanted: str) -> int:
+    steps = checkpoints.steps()
+    if not steps:
+        raise ConfigError(f"{run_dir}: holds no checkpoint")
+    if wanted == "last":
+        return steps[-1]
+    if wanted == "best":
+        return checkpoints.best()
+    if wanted.isdigit() and int(wanted) in steps:
+        return int(wanted)
+    raise ConfigError(f"--checkpoint: {wanted!r} is not among last, best, {', '.join(map(str, steps))}")
+
+
+def _prepare(run_dir: Path, config: Config) -> None:
+    if run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
+        raise ConfigError(
+            f"{run_dir}: is not empty; choose another --run-dir, or go on with it: star train --resume {run_dir}"
+        )
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        (run_dir / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{run_dir}: cannot be written: {error.strerror}") from None
+
+
+def _resolve(config: Config, engine: str, spec: Spec) -> Config:
+    """`config` with the engine and the initial cuts that are really used."""
+    values = config.model_dump(mode="json")
+    values["env"]["engine"] = engine
+    if values["abstraction"]["cuts"] is None:
+        values["abstraction"]["cuts"] = spec.region_cuts
+    return parse(values)
+
+
+def _make_env(config: Config, goals: str) -> Any:
+    options = {"goals": goals} | config.env.options if goals == "train" else config.env.options | {"goals": goals}
+    try:
+        return envs.make(config.env.name, engine=config.env.engine, **options)
+    except envs.EnvError as error:
+        raise ConfigError(f"env: {error}") from None
+
+
+def _seed_keys(program: Program) -> jax.Array:
+    return jax.vmap(jax.random.key)(np.asarray(program.seeds, np.uint32))
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[Callable[[], bool]]:
+    """Yields a function that tells whether Ctrl-C was pressed; a second Ctrl-C stops at once."""
+    pressed = False
+
+    def on_interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal pressed
+        if pressed:
+            raise KeyboardInterrupt
+        pressed = True
+
+    before = signal.signal(signal.SIGINT, on_interrupt)
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
