@@ -25,7 +25,7 @@ from flax import struct
 from mujoco import mjx, rollout
 
 from envs.batching import flattened
-from envs.options import EnvError, known
+from envs.options import EnvError
 
 CONTACTS = 24  # per environment; MJX-Warp pools them over the batch
 CONSTRAINT_ROWS = 96  # per environment, MJX-Warp
@@ -37,6 +37,8 @@ INTEGRATORS = {
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
 }
 SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
+
+_POOL = threading.Lock()  # mujoco.rollout has one thread pool for the process, and runs one rollout at a time
 
 
 @struct.dataclass
@@ -86,22 +88,20 @@ def engines() -> tuple[str, ...]:
 
 
 def resolve_engine(engine: str) -> str:
-    """The engine to use on this machine: for `auto` the fastest, else `engine` itself.
+    """The engine to use on this machine: for `auto` the fastest, else `engine` itself, one of `engines()`.
 
     Raises:
-      EnvError: if the name is unknown, or the package or device it needs is missing.
+      EnvError: if the package or the device that `warp` needs is missing.
     """
-    if engine not in engines():
-        raise EnvError(f'engine "{engine}" is unknown; {known(engine, engines())}')
-    nvidia, warp = _has_nvidia_gpu(), importlib.util.find_spec("warp") is not None
-    if engine == "warp" and not (nvidia and warp):
-        lacking = [need for need, met in (("an NVIDIA GPU", nvidia), ('pip install "star-rl[warp]"', warp)) if not met]
-        raise EnvError(f'engine "warp" needs {" and ".join(lacking)}; here choose native, jax or auto')
-    if engine != "auto":
+    if engine not in ("auto", "warp"):
         return engine
-    if jax.default_backend() == "cpu":
-        return "native"
-    return "warp" if nvidia and warp else "jax"
+    nvidia, warp = _has_nvidia_gpu(), importlib.util.find_spec("warp") is not None
+    if nvidia and warp:
+        return "warp"
+    if engine == "auto":
+        return "native" if jax.default_backend() == "cpu" else "jax"
+    lacking = [need for need, met in (("an NVIDIA GPU", nvidia), ('pip install "star-rl[warp]"', warp)) if not met]
+    raise EnvError(f'engine "warp" needs {" and ".join(lacking)}; here choose native, jax or auto')
 
 
 def _has_nvidia_gpu() -> bool:
@@ -109,25 +109,24 @@ def _has_nvidia_gpu() -> bool:
 
 
 def _native(model: mujoco.MjModel, frames: int) -> StepBatch:
-    """MuJoCo in C: `mujoco.rollout` over all cores this process may use, called from the device program."""
-    threads = [mujoco.MjData(model) for _ in range(len(os.sched_getaffinity(0)))]
-    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    """MuJoCo in C: `mujoco.rollout` over all cores this process may use, called from the compiled program."""
+    threads = [mujoco.MjData(model) for _ in os.sched_getaffinity(0)]
+    split = np.cumsum([1, model.nq, model.nv])  # MuJoCo's state is time, qpos, qvel
+    idle = np.concatenate([[0.0], model.qpos0, np.zeros(model.nv + model.nu)])
     duration = frames * model.opt.timestep
 
     def advance(qpos: Any, qvel: Any, ctrl: Any) -> tuple[np.ndarray, np.ndarray]:
-        state = np.zeros((len(qpos), size))
-        state[:, 1 : 1 + model.nq] = qpos
-        state[:, 1 + model.nq : 1 + model.nq + model.nv] = qvel
-        broken = ~np.isfinite(state).all(axis=1)
-        state[broken, 1 : 1 + model.nq] = model.qpos0  # MuJoCo would log a warning for each of them
-        state[broken, 1 + model.nq :] = 0
-        controls = np.repeat(np.nan_to_num(np.asarray(ctrl, np.float64))[:, None], frames, axis=1)
+        start = np.hstack([np.zeros((len(qpos), 1)), qpos, qvel, ctrl])
+        broken = ~np.isfinite(start).all(axis=1)
+        start[broken] = idle  # MuJoCo would log a warning for each of them
+        controls = np.repeat(start[:, None, split[2] :], frames, axis=1)
         with _POOL:
-            states, _ = rollout.rollout(model, threads, state, controls, persistent_pool=True)
-        state = states[:, -1].astype(np.float32)
-        # A rollout that MuJoCo finds unstable is cut short, which shows in its clock.
-        state[broken | (states[:, -1, 0] < duration - model.opt.timestep / 2)] = np.nan
-        return state[:, 1 : 1 + model.nq], state[:, 1 + model.nq : 1 + model.nq + model.nv]
+            states, _ = rollout.rollout(model, threads, start[:, : split[2]], controls, persistent_pool=True)
+        end = states[:, -1]
+        broken |= end[:, 0] < duration - model.opt.timestep / 2  # cut short: MuJoCo found it unstable
+        end[broken] = np.nan
+        _, qpos, qvel = np.split(end.astype(np.float32), split[:2], axis=1)
+        return qpos, qvel
 
     def step(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in (data.qpos, data.qvel))
@@ -135,9 +134,6 @@ def _native(model: mujoco.MjModel, frames: int) -> StepBatch:
         return PhysicsState(qpos, qvel, data.warmstart, data.overflow)
 
     return step
-
-
-_POOL = threading.Lock()  # the pool of mujoco.rollout is one for the process, and runs one rollout at a time
 
 
 def _jax(model: mujoco.MjModel, frames: int) -> StepBatch:
@@ -153,16 +149,27 @@ def _jax(model: mujoco.MjModel, frames: int) -> StepBatch:
 
 def _warp(model: mujoco.MjModel, frames: int) -> StepBatch:
     """MJX-Warp. Its contact buffer is shared by the batch, so blank data is made for each batch size."""
+    import warp
+
+    warp.config.quiet = True  # it would report every kernel that it compiles
     device_model = mjx.put_model(model, impl="warp").tree_replace({"opt._impl.warn_overflow": 0})
 
     def overflow(full: mjx.Data) -> jax.Array:
         return ((full._impl.overflow & OVERFLOW_BITS) != 0).astype(jnp.float32)
 
     def step(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
-        blank = mjx.make_data(model, impl="warp", naconmax=len(ctrl) * CONTACTS, njmax=CONSTRAINT_ROWS)
-        return _mjx_step(device_model, blank, frames, overflow, data, ctrl)
+        with jax.ensure_compile_time_eval():
+            blank = mjx.make_data(model, impl="warp", naconmax=len(ctrl) * CONTACTS, njmax=CONSTRAINT_ROWS)
+        return _mjx_step(device_model, jax.tree.map(_as_fill, blank), frames, overflow, data, ctrl)
 
     return step
+
+
+def _as_fill(leaf: jax.Array) -> jax.Array:
+    """`leaf` as an operation if it holds a single value, since buffers of a whole batch make huge constants."""
+    host = np.asarray(leaf)
+    uniform = host.size > 1 and (host == host.flat[0]).all()
+    return jnp.full(host.shape, host.flat[0], host.dtype) if uniform else leaf
 
 
 def _mjx_step(

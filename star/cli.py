@@ -10,6 +10,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, NoReturn
 
+import yaml
+
 from star.config import Config, ConfigError, fields, load
 
 _HELP = """\
@@ -49,7 +51,8 @@ def _run(arguments: list[str]) -> int:
     if options.command is None:
         parser.print_help()
         return 0
-    overrides = _overrides(rest, options)
+    flags = {name: _value(value) for name, value in vars(options).items() if "." in name and value is not None}
+    overrides = flags | settings_from(rest)
     return options.function(options, overrides)
 
 
@@ -84,10 +87,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _overrides(rest: Sequence[str], options: argparse.Namespace) -> dict[str, Any]:
-    """Dotted settings from `--section.key VALUE` or `--section.key=VALUE`, and from the named flags."""
-    found: dict[str, Any] = {k: v for k, v in vars(options).items() if "." in k and v is not None}
-    waiting = list(rest)
+def settings_from(arguments: Sequence[str]) -> dict[str, Any]:
+    """Dotted settings from `--section.key VALUE` or `--section.key=VALUE`; raises `ConfigError` for anything else."""
+    found: dict[str, Any] = {}
+    waiting = list(arguments)
     while waiting:
         flag = waiting.pop(0)
         name, equals, value = flag.removeprefix("--").partition("=")
@@ -97,20 +100,16 @@ def _overrides(rest: Sequence[str], options: argparse.Namespace) -> dict[str, An
             if not waiting:
                 raise ConfigError(f"{flag}: needs a value")
             value = waiting.pop(0)
-        found[name] = value
-    return {name: _value(text) for name, text in found.items()}
+        found[name] = _value(value)
+    return found
 
 
 def _value(text: str) -> Any:
-    """Lists and mappings as in YAML; everything else is left to the validation of the config."""
-    import yaml
-
-    if text[:1] in "[{" or text in ("true", "false", "null"):
-        try:
-            return yaml.safe_load(text)
-        except yaml.YAMLError:
-            return text
-    return text
+    """Numbers, lists and the like as YAML reads them; text that YAML does not read stays text."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text
 
 
 def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:

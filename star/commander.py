@@ -56,7 +56,7 @@ def init(*, regions: int) -> CommanderState:
 
 
 def successors(
-    mode: Literal["possible", "known"],
+    mode: Literal["any", "possible", "known"],
     *,
     reaches: Bool[Array, "R R"],
     misses: Bool[Array, "R R"],
@@ -64,14 +64,15 @@ def successors(
 ) -> Successors:
     """Targets allowed from each region by what is known of reachability.
 
-    `possible` leaves out the targets shown unreachable; `known` is the published rule: the targets shown reachable,
-    if there are any. A region may always be its own target, and random choices may always try the unknown.
+    Random choices leave out the targets shown unreachable. Greedy ones are made among all targets (`any`), among
+    those not shown unreachable (`possible`), or among those shown reachable, if there are any (`known`, published).
+    A region may always be its own target.
     """
     pairs = active[:, None] & active[None, :]
     own = jnp.eye(active.shape[0], dtype=bool)
     possible = pairs & (~misses | own)
-    if mode == "possible":
-        return Successors(greedy=possible, explore=possible)
+    if mode != "known":
+        return Successors(greedy=pairs if mode == "any" else possible, explore=possible)
     known = pairs & reaches & ~own
     has_known = known.any(axis=1, keepdims=True)
     return Successors(greedy=jnp.where(has_known, known | (own & pairs), possible), explore=possible)

@@ -115,8 +115,8 @@ class CommanderConfig(Section):
     epsilon_start: float = Field(0.5, ge=0, le=1, description="share of random targets at the start")
     epsilon_end: float = Field(0.1, ge=0, le=1, description="share of random targets after epsilon_steps")
     epsilon_steps: float = Field(1e6, gt=0, description="env steps over which epsilon falls linearly")
-    successors: Literal["possible", "known"] = Field(
-        "possible", description="greedy choice among all targets not shown unreachable, or the known-reachable only"
+    successors: Literal["any", "possible", "known"] = Field(
+        "any", description="greedy choice among all targets, those not shown unreachable, or the known-reachable ones"
     )
     goal_margin: float = Field(
         1.0, gt=0, description="half-width of the box around g* given to the Tutor in its region"

@@ -113,7 +113,7 @@ def _learn_between_episodes(
     state = state.replace(forward_model=model, graph=graph)
     refine_metrics: Metrics = {}
     if config.refinement.enabled:
-        state, refine_metrics = _refine(config, state)
+        state, refine_metrics = refine(config, state)
     state = state.replace(commander=state.commander.replace(chosen=0.9 * state.commander.chosen))
     metrics = (
         _prefix("forward_model", model_metrics | {"error": jnp.sqrt(_weighted(error, outcome.weight))})
@@ -123,7 +123,8 @@ def _learn_between_episodes(
     return state, metrics
 
 
-def _refine(config: AgentConfig, state: TrainState) -> tuple[TrainState, Metrics]:
+def refine(config: AgentConfig, state: TrainState) -> tuple[TrainState, Metrics]:
+    """Examine pairs, cut regions, and let the tables that regions index follow every cut."""
     abstraction, graph, splits, metrics = refinement.refine(config, state.abstraction, state.graph, state.forward_model)
 
     def follow(commander_state: CommanderState, split: refinement.Split) -> tuple[CommanderState, None]:

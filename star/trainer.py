@@ -111,7 +111,7 @@ def train(
         state, rows = _restore(program, checkpoints, sink)
     else:
         _prepare(run_dir, program.config)
-        state, rows = program.init(_seed_keys(program)), []
+        state, rows = program.init(seed_keys(program)), []
     try:
         return _loop(program, state, rows, run_dir, checkpoints, sink, quiet=quiet, console=console)
     finally:
@@ -125,7 +125,7 @@ def evaluate(config: Config, run_dir: Path, *, checkpoint: str = "last", seed: i
     try:
         step = _choose(checkpoints, run_dir, checkpoint)
         check_compatible(checkpoints.config(step), program.config, source=run_dir)
-        state = checkpoints.restore(step, jax.eval_shape(program.init, _seed_keys(program)))
+        state = checkpoints.restore(step, jax.eval_shape(program.init, seed_keys(program)))
     finally:
         checkpoints.close()
     # Epochs count from 1, so these goals and starts are none that training was evaluated on.
@@ -142,6 +142,11 @@ def evaluation_keys(program: Program, epoch: int) -> jax.Array:
     """Keys of the evaluation after `epoch`, one per seed, apart from all keys of training."""
     base = jax.random.fold_in(jax.random.key(_EVALUATION_SEED), epoch)
     return jax.vmap(partial(jax.random.fold_in, base))(np.asarray(program.seeds))
+
+
+def seed_keys(program: Program) -> jax.Array:
+    """Keys that the states of all seeds start from."""
+    return jax.vmap(jax.random.key)(np.asarray(program.seeds, np.uint32))
 
 
 def select_device(device: str) -> None:
@@ -231,7 +236,7 @@ def _restore(program: Program, checkpoints: Checkpoints, sink: JsonLines) -> tup
     if not steps:
         raise ConfigError(f"{sink.path.parent}: holds no checkpoint to resume from")
     check_compatible(checkpoints.config(steps[-1]), program.config, source=sink.path.parent)
-    example = jax.eval_shape(program.init, _seed_keys(program))
+    example = jax.eval_shape(program.init, seed_keys(program))
     return checkpoints.restore(steps[-1], example), sink.keep_until(steps[-1])
 
 
@@ -275,10 +280,6 @@ def _make_env(config: Config, goals: str) -> Any:
         return envs.make(config.env.name, engine=config.env.engine, **options)
     except envs.EnvError as error:
         raise ConfigError(f"env: {error}") from None
-
-
-def _seed_keys(program: Program) -> jax.Array:
-    return jax.vmap(jax.random.key)(np.asarray(program.seeds, np.uint32))
 
 
 @contextlib.contextmanager

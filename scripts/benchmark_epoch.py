@@ -1,0 +1,102 @@
+"""Where the time of an epoch goes: bare physics, whole epoch, refinement, in one run on one machine.
+
+    python scripts/benchmark_epoch.py configs/ant_maze.yaml [--epochs 3] [--section.key VALUE ...]
+
+Prints one JSON object. Speeds are env steps/s of all environments and seeds. `refinement_share` is the time that the
+refinement alone takes over that of the epoch that contains it; `forward_model_share` likewise for its training.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+import envs
+from star import cli, hierarchy, trainer
+from star import forward_model as models
+from star.config import load
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("config", type=Path)
+    parser.add_argument("--epochs", type=int, default=3)
+    options, rest = parser.parse_known_args()
+    print(json.dumps(benchmark(options.config, options.epochs, cli.settings_from(rest))))
+
+
+def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, Any]:
+    """Time the parts of `epochs` epochs after one that warms up."""
+    program = trainer.build(load(path, overrides))
+    config, agent = program.config, program.config.agent()
+    state = program.init(trainer.seed_keys(program))
+    steps = program.env_steps_per_epoch * len(program.seeds)
+
+    compile_began = time.perf_counter()
+    state, _ = jax.block_until_ready(program.epoch(state))
+    compile_s = time.perf_counter() - compile_began
+    began = time.perf_counter()
+    for _ in range(epochs):
+        state, _ = program.epoch(state)
+    jax.block_until_ready(state)
+    epoch_s = (time.perf_counter() - began) / epochs
+
+    refine = jax.jit(jax.vmap(partial(hierarchy.refine, agent)))
+    fresh = jax.tree.map(
+        lambda x: x[:, 0, : min(x.shape[2], program.config.trainer.num_envs * 16)], state.forward_model.ring.experience
+    )
+    keys = jax.random.split(jax.random.key(0), len(program.seeds))
+    train = jax.jit(jax.vmap(lambda s, f, k: models.train(agent.forward_model, s, f, key=k)))
+    return {
+        "task": config.env.name,
+        "engine": config.env.engine,
+        "num_envs": config.trainer.num_envs,
+        "seeds": len(program.seeds),
+        "device": jax.devices()[0].device_kind,
+        "versions": {"python": platform.python_version(), "jax": jax.__version__},
+        "epoch_s": epoch_s,
+        "first_epoch_s": compile_s,
+        "env_steps_per_s": steps / epoch_s,
+        "physics_env_steps_per_s": _physics_speed(program, len(program.seeds)),
+        "refinement_share": _seconds(refine, state) / epoch_s,
+        "forward_model_share": _seconds(train, state.forward_model, fresh, keys) / epoch_s,
+    }
+
+
+def _physics_speed(program: trainer.Program, seeds: int, steps: int = 200) -> float:
+    """Env steps/s of the environment alone under random actions drawn in advance."""
+    config = program.config
+    env = envs.make(config.env.name, engine=config.env.engine, **config.env.options)
+    batch = envs.VectorEnv(env, config.trainer.num_envs * seeds, auto_reset=False)
+    actions = jax.random.uniform(jax.random.key(1), (batch.num_envs, env.action_size), minval=-1.0)
+
+    @jax.jit
+    def run(state: Any) -> Any:
+        return jax.lax.scan(lambda s, _: (batch.step(s, actions), None), state, None, length=steps)[0]
+
+    state = jax.jit(batch.reset)(jax.random.key(0))
+    return steps * batch.num_envs / _seconds(run, state)
+
+
+def _seconds(function: Callable[..., Any], *arguments: Any, repeats: int = 5) -> float:
+    """Median wall-clock of a call after one that compiles."""
+    jax.block_until_ready(function(*arguments))
+    times = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(function(*arguments))
+        times.append(time.perf_counter() - began)
+    return float(jnp.median(jnp.asarray(times)))
+
+
+if __name__ == "__main__":
+    main()

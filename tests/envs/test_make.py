@@ -1,0 +1,60 @@
+import subprocess
+import sys
+import time
+
+import jax
+import pytest
+
+import envs
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("point_mase", {}, ["point_mase", "point_maze", "ant_maze"]),
+        ("point_maze", {"goal": "test"}, ["goal", "test", "goals"]),
+        ("point_maze", {"goals": "tests"}, ["goals", "tests", "train, test"]),
+        ("point_maze", {"episode_length": 0}, ["episode_length", "0", "above 0"]),
+        ("point_maze", {"episode_length": True}, ["episode_length", "True", "whole number"]),
+        ("point_maze", {"engine": "native"}, ["native", "auto, jax"]),
+        ("ant_maze", {"engine": "wrap"}, ["wrap", 'did you mean "warp"']),
+        ("ant_maze", {"integrator": "RK4"}, ["integrator", "RK4", "rk4"]),
+        ("ant_maze", {"timestep": -0.1}, ["timestep", "-0.1", "seconds"]),
+    ],
+)
+def test_a_wrong_name_or_value_is_told_in_one_line(name, options, words):
+    with pytest.raises(envs.EnvError) as caught:
+        envs.make(name, **options)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert all(word in message for word in words)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="needs a machine without a GPU")
+def test_an_engine_that_cannot_run_here_says_what_it_needs():
+    with pytest.raises(envs.EnvError, match="NVIDIA GPU") as caught:
+        envs.make("ant_maze", engine="warp")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="needs a machine without a GPU")
+def test_auto_takes_native_physics_on_a_cpu():
+    assert envs.make("ant_maze").engine == "native"
+    assert envs.make("point_maze").engine == "jax"
+
+
+@pytest.mark.parametrize("name", envs.names())
+def test_every_task_can_be_made_and_names_itself(name):
+    assert envs.make(name).name == name
+
+
+def test_an_error_is_a_value_error():
+    assert issubclass(envs.EnvError, ValueError)
+
+
+def test_import_and_make_are_silent_and_quick():
+    began = time.monotonic()
+    code = "import envs; [envs.make(name) for name in envs.names()]"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")
+    assert time.monotonic() - began < 15

@@ -1,0 +1,162 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs.maze import MazeEnv
+
+B = 4
+
+
+@pytest.fixture(scope="module")
+def env():
+    return envs.make("point_maze", episode_length=3)
+
+
+def act(env, seed=0):
+    return jax.random.uniform(jax.random.key(seed), (B, env.action_size), minval=-1, maxval=1)
+
+
+def stepper(vector):
+    return jax.jit(vector.step)
+
+
+def leaves(tree):
+    """All leaves as numpy arrays, typed keys by their data."""
+    arrays = (
+        jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        for leaf in jax.tree.leaves(tree)
+    )
+    return [np.asarray(array) for array in arrays]
+
+
+def rollout(vector, state, actions):
+    """The last state, and the observations and flags of every step, under `actions` [T, B, A]."""
+
+    def step(state, action):
+        state = vector.step(state, action)
+        return state, (state.obs, state.info["final_obs"], state.done)
+
+    return jax.lax.scan(step, state, actions)
+
+
+def test_finished_environments_begin_new_episodes_with_new_goals(env):
+    vector = envs.VectorEnv(env, B)
+    state, step = vector.reset(jax.random.key(0)), stepper(vector)
+    goals = [state.obs[:, env.state_dim :]]
+    for _ in range(4):
+        for _ in range(env.episode_length):
+            state = step(state, act(env))
+        np.testing.assert_array_equal(state.info["steps"], 0)
+        goals.append(state.obs[:, env.state_dim :])
+        assert (np.abs(state.obs[:, :2]) <= 0.1).all()
+    assert len(np.unique(np.concatenate(goals), axis=0)) == 5 * B
+
+
+def test_final_obs_flags_and_reward_are_those_of_the_finished_step(env):
+    vector, plain = envs.VectorEnv(env, B), envs.VectorEnv(env, B, auto_reset=False)
+    state, expected = vector.reset(jax.random.key(0)), plain.reset(jax.random.key(0))
+    step, plain_step = stepper(vector), stepper(plain)
+    for seed in range(env.episode_length):
+        state, expected = step(state, act(env, seed)), plain_step(expected, act(env, seed))
+    np.testing.assert_array_equal(state.info["final_obs"], expected.obs)
+    np.testing.assert_array_equal(state.done, np.ones(B))
+    np.testing.assert_array_equal(state.info["truncation"], np.ones(B))
+    np.testing.assert_array_equal(state.reward, expected.reward)
+    np.testing.assert_array_equal(state.metrics["distance"], expected.metrics["distance"])
+    assert (state.obs != expected.obs).any(axis=1).all()
+    np.testing.assert_array_equal(step(state, act(env)).done, np.zeros(B))
+
+
+def test_without_auto_reset_a_step_never_resets(env):
+    vector = envs.VectorEnv(env, B, auto_reset=False)
+    state, step = vector.reset(jax.random.key(0)), stepper(vector)
+    for _ in range(env.episode_length + 2):
+        state = step(state, act(env))
+        np.testing.assert_array_equal(state.info["final_obs"], state.obs)
+    np.testing.assert_array_equal(state.info["steps"], env.episode_length + 2)
+    np.testing.assert_array_equal(state.done, np.ones(B))
+
+
+def test_only_the_environments_that_finish_are_reset(env):
+    vector = envs.VectorEnv(env, B)
+    step = stepper(vector)
+    state = step(vector.reset(jax.random.key(0)), act(env))
+    state = vector.reset_where(state, jnp.array([True, False, False, False]), jax.random.key(1))
+    for _ in range(2):
+        state = step(state, act(env))
+    np.testing.assert_array_equal(state.done, [0.0, 1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(state.info["steps"], [2, 0, 0, 0])
+
+
+@pytest.mark.parametrize("name", ["point_maze", "ant_maze"])
+def test_reset_where_resets_everything_of_the_masked_and_nothing_else(name):
+    env = envs.make(name, **({"engine": "native"} if name == "ant_maze" else {}))
+    vector = envs.VectorEnv(env, B, auto_reset=False)
+    mask = np.array([True, False, True, False])
+    reset, step = jax.jit(vector.reset), stepper(vector)
+    before = reset(jax.random.key(0))
+    for _ in range(2):
+        before = step(before, jnp.ones((B, env.action_size)))
+    after = jax.jit(vector.reset_where)(before, jnp.asarray(mask), jax.random.key(7))
+    fresh = reset(jax.random.key(7))
+    for old, new, start in zip(leaves(before), leaves(after), leaves(fresh), strict=True):
+        np.testing.assert_array_equal(new[~mask], old[~mask])
+        np.testing.assert_array_equal(new[mask], start[mask])
+
+
+def test_environments_of_a_batch_differ(env):
+    state = envs.VectorEnv(env, B).reset(jax.random.key(0))
+    assert len(np.unique(state.obs, axis=0)) == B
+
+
+@pytest.mark.parametrize(("name", "auto_reset"), [("point_maze", True), ("ant_maze", False)])
+def test_a_vmap_over_seeds_equals_a_loop_over_them(name, auto_reset):
+    env = envs.make(name, episode_length=3, **({"engine": "native"} if name == "ant_maze" else {}))
+    vector = envs.VectorEnv(env, B, auto_reset=auto_reset)
+    states = jax.jit(jax.vmap(vector.reset))(jax.random.split(jax.random.key(0), 3))
+    actions = jax.random.uniform(jax.random.key(1), (3, 5, B, env.action_size), minval=-1, maxval=1)
+    together = jax.jit(jax.vmap(lambda *seed: rollout(vector, *seed)))(states, actions)
+    single = jax.jit(lambda *seed: rollout(vector, *seed))
+    seeds = [jax.tree.map(lambda leaf, i=i: leaf[i], (states, actions)) for i in range(3)]
+    apart = jax.tree.map(lambda *leaf: jnp.stack(leaf), *[single(*seed) for seed in seeds])
+    for a, b in zip(leaves(together), leaves(apart), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+
+
+def test_any_number_of_vmaps_is_one_batch_for_the_environment(monkeypatch):
+    env, seen = envs.make("point_maze"), []
+
+    def spied_step(state, action):
+        def spy(obs):
+            seen.append(obs.shape)
+            return obs
+
+        obs = jax.pure_callback(spy, jax.typeof(state.obs), state.obs, vmap_method="expand_dims")
+        return MazeEnv.step(env, state.replace(obs=obs), action)
+
+    monkeypatch.setattr(env, "step", spied_step)
+    vector = envs.VectorEnv(env, B, auto_reset=False)
+    state = jax.jit(jax.vmap(jax.vmap(vector.reset)))(jax.random.split(jax.random.key(0), (2, 3)))
+    state = jax.jit(jax.vmap(jax.vmap(vector.step)))(state, jnp.zeros((2, 3, B, 2)))
+    assert state.reward.shape == (2, 3, B)
+    assert seen == [(2 * 3 * B, env.observation_size)]
+
+
+def test_an_action_shared_by_all_seeds_is_broadcast(env):
+    vector = envs.VectorEnv(env, B, auto_reset=False)
+    state = jax.jit(jax.vmap(vector.reset))(jax.random.split(jax.random.key(0), 3))
+    action = act(env)
+    shared = jax.jit(jax.vmap(vector.step, in_axes=(0, None)))(state, action)
+    repeated = jax.jit(jax.vmap(vector.step))(state, jnp.broadcast_to(action, (3, *action.shape)))
+    for a, b in zip(leaves(shared), leaves(repeated), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_typed_keys_are_carried_like_raw_ones(env):
+    vector = envs.VectorEnv(env, B)
+    ended = jnp.full((B, env.action_size), jnp.nan)  # ends every episode, so that the carried keys are used
+    typed, raw = (stepper(vector)(vector.reset(key), ended) for key in (jax.random.key(3), jax.random.PRNGKey(3)))
+    np.testing.assert_array_equal(typed.done, np.ones(B))
+    np.testing.assert_array_equal(typed.obs, raw.obs)
