@@ -1,11 +1,12 @@
 """The Commander: chooses the target region, every k env steps, by tabular Q-learning over regions.
 
     target  <- epsilon-greedy in Q[region, goal region, .] over the successors that reachability allows
-    after k steps, with r = max over them of -||g* - s||:
+    after k steps, with r = max (`max`, published) or mean (`mean`) over them of -||g* - s||:
     Q[i, g, j] <- Q + alpha_n (r + gamma max_j' Q[i', g, j'] - Q)
 
-The B environments are B streams of one table: at each instant the errors of a cell are averaged over the n streams
-that visited it, and alpha_n = 1 - (1 - alpha)^n is the step that n updates in a row towards that average would make.
+The B environments are B streams of one table: the errors of a cell are averaged over the n decisions of a batch that
+visited it, and alpha_n = 1 - (1 - alpha)^n is the step that n updates in a row towards that average would make. A batch
+is what all streams decided at one instant (`sweeps` 0, published), or in a whole epoch, swept `sweeps` times.
 
 Source: STAR (ICLR 2024), section 4.1.
 """
@@ -106,7 +107,7 @@ def act(
 def update(
     config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision
 ) -> tuple[CommanderState, Metrics]:
-    """One instant of Q-learning for all streams; time limits are not seen here, so every period bootstraps."""
+    """One step of Q-learning on a batch; time limits are not seen here, so every period bootstraps."""
     future = _values(state.q, allowed.greedy, batch.next_region, batch.goal_region).max(axis=-1)
     cell = (batch.region, batch.goal_region, batch.target)
     error = batch.reward + config.discount * future - state.q[cell]
@@ -120,6 +121,40 @@ def update(
         "td_error": jnp.sum(jnp.abs(error) * batch.weight) / n,
     }
     return state.replace(q=q), metrics
+
+
+def start_reward(config: CommanderConfig) -> float:
+    """What the reward of a period is accumulated from."""
+    return -jnp.inf if config.reward == "max" else 0.0
+
+
+def accumulate(
+    config: CommanderConfig,
+    reward: Float[Array, "B"],
+    external: Float[Array, "l B"],
+    alive: Float[Array, "l B"],
+) -> Float[Array, "B"]:
+    """The reward of periods so far, after l more env steps with external rewards r_ext; `alive` masks ended ones.
+
+    The maximum is the same whether the agent stays at the goal or leaves it again; the mean tells them apart.
+    """
+    if config.reward == "max":
+        return jnp.maximum(reward, jnp.where(alive > 0, external, -jnp.inf).max(axis=0))
+    return reward + jnp.sum(external * alive, axis=0) / config.period
+
+
+def sweep(
+    config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision
+) -> tuple[CommanderState, Metrics]:
+    """`config.sweeps` updates on the decisions of a whole epoch: fitted Q iteration.
+
+    All environments live through the phases of an episode together, so the visitors of a cell at one instant are not
+    representative (late in an episode, they are those that are stuck there); those of an epoch are.
+    """
+    state, metrics = jax.lax.scan(
+        lambda state, _: update(config, state, allowed, batch), state, None, length=config.sweeps
+    )
+    return state, jax.tree.map(lambda x: x[-1], metrics)
 
 
 def on_split(state: CommanderState, *, parent: Int[Array, ""], child: Int[Array, ""]) -> CommanderState:

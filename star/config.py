@@ -118,6 +118,12 @@ class CommanderConfig(Section):
     successors: Literal["any", "possible", "known"] = Field(
         "any", description="greedy choice among all targets, those not shown unreachable, or the known-reachable ones"
     )
+    reward: Literal["mean", "max"] = Field(
+        "mean", description="mean of r_ext over the k env steps of a decision, or its maximum"
+    )
+    sweeps: Count = Field(
+        20, description="sweeps over all decisions of an epoch between episodes; 0 learns at every instant instead"
+    )
     goal_margin: float = Field(
         1.0, gt=0, description="half-width of the box around g* given to the Tutor in its region"
     )

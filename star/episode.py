@@ -37,7 +37,7 @@ class Streams(struct.PyTreeNode):
     target: Int[Array, "B"]
     box: Box
     start: Float[Array, "B d"]
-    best: Float[Array, "B"]
+    reward: Float[Array, "B"]
     episode: Episode
 
 
@@ -99,7 +99,7 @@ def start(spec: Spec, env: VectorEnv, abstraction: Abstraction, *, key: Array) -
         target=nothing,
         box=Box(lower=jnp.zeros_like(abstract), upper=jnp.zeros_like(abstract)),
         start=abstract,
-        best=jnp.full(n, -jnp.inf),
+        reward=jnp.zeros(n),
         episode=Episode.start(n),
     )
 
@@ -137,7 +137,7 @@ def command(
         target=target,
         box=target_box(config, spec, state.abstraction, target, goal_region, spec.goal_point(obs)),
         start=spec.abstract(obs),
-        best=jnp.full_like(streams.best, -jnp.inf),
+        reward=jnp.full_like(streams.reward, commander.start_reward(config.commander)),
         episode=streams.episode,
     )
     return _select(streams.clock == 0, fresh, streams)
@@ -202,8 +202,8 @@ def rollout(
 
     carry = (streams.env, subgoal, jnp.ones(env.num_envs), streams.episode)
     (env_state, _, _, episode), steps = jax.lax.scan(step, carry, jax.random.split(key, config.tutor.period))
-    best = jnp.maximum(streams.best, jnp.where(steps.alive > 0, steps.reward, -jnp.inf).max(axis=0))
-    return streams.replace(env=env_state, episode=episode, best=best), steps
+    reward = commander.accumulate(config.commander, streams.reward, steps.reward, steps.alive)
+    return streams.replace(env=env_state, episode=episode, reward=reward), steps
 
 
 def advance(config: AgentConfig, streams: Streams, steps: Steps) -> Streams:

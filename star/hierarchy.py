@@ -84,7 +84,10 @@ def _segment(
     )
     streams = episode.advance(config, streams, steps)
     decision, outcome = _finished_period(config, spec, state, streams, steps)
-    commander_state, commander_metrics = commander.update(config.commander, state.commander, allowed, decision)
+    commander_state = state.commander
+    commander_metrics: Metrics = {}
+    if not config.commander.sweeps:
+        commander_state, commander_metrics = commander.update(config.commander, commander_state, allowed, decision)
     transition = _tutor_transition(config, spec, streams, began, tutor_action, steps)
     commander_state = commander_state.replace(chosen=commander_state.chosen.at[decision.target].add(decision.weight))
     metrics = (
@@ -102,6 +105,12 @@ def _learn_between_episodes(
 ) -> tuple[TrainState, Metrics]:
     """Train the forward model on the epoch's periods and refine the abstraction."""
     pick_key, train_key = jax.random.split(key)
+    commander_metrics: Metrics = {}
+    if config.commander.sweeps:
+        swept, commander_metrics = commander.sweep(
+            config.commander, state.commander, episode.successors(config, state), finished[0]
+        )
+        state = state.replace(commander=swept)
     periods = num_envs * (spec.episode_length // config.commander.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
     error = forward_model.errors(config.forward_model, state.forward_model, outcome)
@@ -116,7 +125,8 @@ def _learn_between_episodes(
         state, refine_metrics = refine(config, state)
     state = state.replace(commander=state.commander.replace(chosen=0.9 * state.commander.chosen))
     metrics = (
-        _prefix("forward_model", model_metrics | {"error": jnp.sqrt(_weighted(error, outcome.weight))})
+        _prefix("commander", commander_metrics)
+        | _prefix("forward_model", model_metrics | {"error": jnp.sqrt(_weighted(error, outcome.weight))})
         | _prefix("refinement", refine_metrics)
         | {"abstraction/regions": state.abstraction.count}
     )
@@ -186,7 +196,7 @@ def _finished_period(
         region=streams.region,
         goal_region=streams.goal_region,
         target=streams.target,
-        reward=streams.best,
+        reward=streams.reward,
         next_region=jax.vmap(partial(regions.locate, state.abstraction))(end),
         weight=weight,
     )
