@@ -26,7 +26,9 @@ from star.episode import Episode
 from star.metrics import Display, JsonLines, mean
 from star.state import Spec, TrainState
 
-_EVALUATION_SEED = 1_000_003
+# Streams of random keys that no seed of training uses.
+_DURING_TRAINING = 2**32 - 1
+_AFTERWARDS = 2**32 - 2
 
 
 @dataclass(frozen=True)
@@ -128,8 +130,8 @@ def evaluate(config: Config, run_dir: Path, *, checkpoint: str = "last", seed: i
         state = checkpoints.restore(step, jax.eval_shape(program.init, seed_keys(program)))
     finally:
         checkpoints.close()
-    # Epochs count from 1, so these goals and starts are none that training was evaluated on.
-    episodes = jax.device_get(program.evaluate(state, evaluation_keys(program, -1 - seed)))
+    keys = evaluation_keys(program, seed, stream=_AFTERWARDS)
+    episodes = jax.device_get(program.evaluate(state, keys))
     per_seed = [
         {"seed": name} | evaluation.summarise(jax.tree.map(lambda x, i=i: x[i], episodes))
         for i, name in enumerate(program.seeds)
@@ -138,10 +140,13 @@ def evaluate(config: Config, run_dir: Path, *, checkpoint: str = "last", seed: i
     return about | evaluation.summarise(episodes) | {"seeds": per_seed}
 
 
-def evaluation_keys(program: Program, epoch: int) -> jax.Array:
-    """Keys of the evaluation after `epoch`, one per seed, apart from all keys of training."""
-    base = jax.random.fold_in(jax.random.key(_EVALUATION_SEED), epoch)
-    return jax.vmap(partial(jax.random.fold_in, base))(np.asarray(program.seeds))
+def evaluation_keys(program: Program, number: int, *, stream: int = _DURING_TRAINING) -> jax.Array:
+    """Keys of one evaluation, one per seed, apart from all keys of training.
+
+    `number` is the epoch in the stream of evaluations during training, or the seed that a user chose afterwards.
+    """
+    base = jax.random.fold_in(jax.random.key(stream), number)
+    return jax.vmap(partial(jax.random.fold_in, base))(np.asarray(program.seeds, np.uint32))
 
 
 def seed_keys(program: Program) -> jax.Array:
