@@ -151,7 +151,7 @@ def _warp(model: mujoco.MjModel, frames: int) -> StepBatch:
     """MJX-Warp. Its contact buffer is shared by the batch, so blank data is made for each batch size."""
     import warp
 
-    warp.config.quiet = True  # it would report every kernel that it compiles
+    warp.config.log_level = warp.LOG_WARNING  # it would report every kernel that it compiles
     device_model = mjx.put_model(model, impl="warp").tree_replace({"opt._impl.warn_overflow": 0})
 
     def overflow(full: mjx.Data) -> jax.Array:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import platform
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -30,8 +31,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("config", type=Path)
     parser.add_argument("--epochs", type=int, default=3)
-    options, rest = parser.parse_known_args()
-    print(json.dumps(benchmark(options.config, options.epochs, cli.settings_from(rest))))
+    words, settings = cli.split_settings(sys.argv[1:])
+    options = parser.parse_args(words)
+    print(json.dumps(benchmark(options.config, options.epochs, settings)))
 
 
 def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, Any]:

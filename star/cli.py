@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 
 import yaml
 
-from star.config import Config, ConfigError, fields, load
+from star.config import Config, ConfigError, fields, load, read_yaml
 
 _HELP = """\
 Train a three-level agent (Commander, Tutor, Controller) whose goal regions refine themselves.
@@ -46,14 +46,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: list[str]) -> int:
-    parser = _parser()
-    options, rest = parser.parse_known_args(arguments)
+    words, overrides = split_settings(arguments)
+    options = _parser().parse_args(words)
     if options.command is None:
-        parser.print_help()
+        _parser().print_help()
         return 0
-    flags = {name: _value(value) for name, value in vars(options).items() if "." in name and value is not None}
-    overrides = flags | settings_from(rest)
-    return options.function(options, overrides)
+    flags = {name: _value(text) for name, text in vars(options).items() if "." in name and text is not None}
+    return options.function(options, flags | overrides)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -75,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("run", type=Path, help="run directory")
     evaluate.add_argument("--episodes", dest="trainer.eval_episodes", metavar="N", help="episodes per seed")
     evaluate.add_argument("--checkpoint", default="last", metavar="last|best|STEPS", help="which one (default: last)")
-    evaluate.add_argument("--evaluation-seed", type=int, default=0, metavar="N", help="seed of goals and starts")
+    evaluate.add_argument("--evaluation-seed", type=_natural, default=0, metavar="N", help="seed of goals and starts")
     evaluate.add_argument("--json", action="store_true", help="print JSON")
     evaluate.set_defaults(function=_evaluate)
 
@@ -87,29 +86,40 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def settings_from(arguments: Sequence[str]) -> dict[str, Any]:
-    """Dotted settings from `--section.key VALUE` or `--section.key=VALUE`; raises `ConfigError` for anything else."""
+def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """Take the dotted settings `--section.key VALUE` or `--section.key=VALUE` out of `arguments`.
+
+    Returns the other words, and the settings; raises `ConfigError` for a setting without a value.
+    """
+    words: list[str] = []
     found: dict[str, Any] = {}
     waiting = list(arguments)
     while waiting:
-        flag = waiting.pop(0)
-        name, equals, value = flag.removeprefix("--").partition("=")
-        if not flag.startswith("--") or "." not in name:
-            raise ConfigError(f"{flag}: unknown argument; settings are given as --section.key VALUE")
+        word = waiting.pop(0)
+        name, equals, value = word.removeprefix("--").partition("=")
+        if not word.startswith("--") or "." not in name:
+            words.append(word)
+            continue
         if not equals:
             if not waiting:
-                raise ConfigError(f"{flag}: needs a value")
+                raise ConfigError(f"{word}: needs a value")
             value = waiting.pop(0)
         found[name] = _value(value)
-    return found
+    return words, found
 
 
 def _value(text: str) -> Any:
     """Numbers, lists and the like as YAML reads them; text that YAML does not read stays text."""
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
+        return read_yaml(text)
+    except (yaml.YAMLError, ValueError, RecursionError):
         return text
+
+
+def _natural(text: str) -> int:
+    if not text.isdecimal() or int(text) >= 2**31:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to 2^31 - 1")
+    return int(text)
 
 
 def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:

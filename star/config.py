@@ -202,7 +202,7 @@ class TrainerConfig(Section):
 
     num_envs: Positive = Field(128, description="environments stepped together, per seed")
     total_env_steps: Positive = Field(2_000_000, description="env steps of all environments, per seed")
-    seed: Count = Field(0, description="first seed")
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="first seed")
     num_seeds: Positive = Field(1, description="seeds trained side by side: seed, seed + 1, ...")
     eval_every: Positive = Field(2, description="epochs between evaluations")
     eval_episodes: Positive = Field(100, description="episodes of each evaluation, per seed")
@@ -268,7 +268,7 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config
     """
     path = Path(path)
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = read_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file{_nearest_file(path)}") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -284,6 +284,24 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: should hold sections such as `trainer:`, not {_show(values)}")
     return parse(values, overrides, source=str(path))
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """YAML's safe loader, but a key given twice is an error instead of a silent choice of the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, str) and key in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"{key} is given twice", key_node.start_mark)
+            seen.add(key if isinstance(key, str) else id(key_node))
+        return super().construct_mapping(node, deep)
+
+
+def read_yaml(text: str) -> Any:
+    """What YAML `text` says; raises `yaml.YAMLError`, `ValueError` or `RecursionError` for what it cannot say."""
+    return yaml.load(text, _UniqueKeys)  # noqa: S506 - a SafeLoader
 
 
 def parse(

@@ -79,7 +79,7 @@ def evaluate(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState,
         streams = command(config, spec, state, allowed, streams, epsilon=0.0, key=command_key)
         subgoal, _ = choose_subgoal(config, spec, state, streams, deterministic=True, key=tutor_key)
         streams, steps = rollout(config, spec, env, state, streams, subgoal, deterministic=True, key=rollout_key)
-        return advance(config, streams, steps), None
+        return advance(config, streams), None
 
     segments = spec.episode_length // config.tutor.period
     return jax.lax.scan(segment, streams, jax.random.split(scan_key, segments))[0].episode
@@ -206,7 +206,7 @@ def rollout(
     return streams.replace(env=env_state, episode=episode, reward=reward), steps
 
 
-def advance(config: AgentConfig, streams: Streams, steps: Steps) -> Streams:
+def advance(config: AgentConfig, streams: Streams) -> Streams:
     """Move the clocks on by one segment; they return to 0 at the end of a period."""
     return streams.replace(clock=(streams.clock + config.tutor.period) % config.commander.period)
 

@@ -82,19 +82,17 @@ def _segment(
     controller_state, controller_metrics = learner.update(
         config.controller, state.controller, _controller_rollout(config, spec, steps), key=update_key
     )
-    streams = episode.advance(config, streams, steps)
+    streams = episode.advance(config, streams)
     decision, outcome = _finished_period(config, spec, state, streams, steps)
     commander_state = state.commander
-    commander_metrics: Metrics = {}
     if not config.commander.sweeps:
-        commander_state, commander_metrics = commander.update(config.commander, commander_state, allowed, decision)
+        commander_state, _ = commander.update(config.commander, commander_state, allowed, decision)
     transition = _tutor_transition(config, spec, streams, began, tutor_action, steps)
     commander_state = commander_state.replace(chosen=commander_state.chosen.at[decision.target].add(decision.weight))
-    metrics = (
-        _prefix("controller", controller_metrics | {"reward": _controller_reward(config, steps)})
-        | _prefix("commander", commander_metrics)
-        | {"tutor/reward": transition.reward.mean(), "env/terminated": (steps.terminated * steps.alive).mean()}
-    )
+    metrics = _prefix("controller", controller_metrics | {"reward": _controller_reward(config, steps)}) | {
+        "tutor/reward": transition.reward.mean(),
+        "env/terminated": (steps.terminated * steps.alive).mean(),
+    }
     streams = episode.restart_ended(config, env, streams, steps, key=reset_key)
     state = state.replace(controller=controller_state, commander=commander_state)
     return (state, streams), (transition, (decision, outcome), metrics)
@@ -105,12 +103,10 @@ def _learn_between_episodes(
 ) -> tuple[TrainState, Metrics]:
     """Train the forward model on the epoch's periods and refine the abstraction."""
     pick_key, train_key = jax.random.split(key)
-    commander_metrics: Metrics = {}
+    learn = commander.sweep if config.commander.sweeps else commander.update
+    learnt, commander_metrics = learn(config.commander, state.commander, episode.successors(config, state), finished[0])
     if config.commander.sweeps:
-        swept, commander_metrics = commander.sweep(
-            config.commander, state.commander, episode.successors(config, state), finished[0]
-        )
-        state = state.replace(commander=swept)
+        state = state.replace(commander=learnt)
     periods = num_envs * (spec.episode_length // config.commander.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
     error = forward_model.errors(config.forward_model, state.forward_model, outcome)

@@ -1,0 +1,152 @@
+"""What all tests share: JAX on the CPU, hypothesis without deadlines, and a tiny hierarchy, recorded step by step."""
+
+import os
+
+os.environ["JAX_PLATFORMS"] = "cpu"
+
+from types import SimpleNamespace  # noqa: E402
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+
+import envs  # noqa: E402
+import star.state  # noqa: E402
+from envs.maze import Geometry, Goals, MazeEnv  # noqa: E402
+from star import config, episode, hierarchy  # noqa: E402
+
+settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
+settings.load_profile("star")
+
+EPISODE = 30
+NUM_ENVS = 8
+
+TINY = {
+    "commander": {"period": 6},
+    "tutor": {"period": 3, "unroll": 2, "ppo": {"hidden": [8], "passes": 1, "minibatches": 2}},
+    "controller": {"ppo": {"hidden": [8], "passes": 1, "minibatches": 2}},
+    # Cuts this close to the start let the agent cross regions in a few steps.
+    "abstraction": {"max_regions": 18, "cuts": [[-0.2, 0.0, 0.2], [-0.2, 0.0, 0.2]], "min_width": 0.01},
+    "forward_model": {"hidden": [8], "batch_size": 8, "buffer_size": 64, "updates_per_epoch": 2},
+    "refinement": {"depth": 2, "pairs_per_epoch": 1, "min_transitions": 1, "min_visits": 1},
+    "trainer": {"num_envs": NUM_ENVS},
+}
+
+
+class Fused:
+    """A body that breaks (turns NaN, which ends the episode early) after 2, 4 or 6 steps in half of all episodes.
+
+    With l = 3 and k = 6, that is within the first segment, within the second, and at the very end of a period.
+    """
+
+    def __init__(self, body):
+        self._body = body
+        self.state_dim, self.action_size, self.dt, self.engine = body.state_dim, body.action_size, body.dt, body.engine
+
+    def init(self, rng):
+        fuses = jnp.array([2.0, 4.0, 6.0, 1e6, 1e6, 1e6])
+        return self._body.init(rng), jax.random.choice(jax.random.fold_in(rng, 1), fuses)
+
+    def step(self, data, action):
+        point, fuse = data
+        point = self._body.step(point, action)
+        broken = jnp.where(fuse <= 1, jnp.nan, point.position)
+        return point.replace(position=broken), fuse - 1
+
+    def observe(self, data, steps):
+        return self._body.observe(data[0], steps)
+
+
+@pytest.fixture(scope="session")
+def tiny():
+    """Values of the tiny hierarchy's configuration: k = 6, l = 3."""
+    return TINY
+
+
+@pytest.fixture(scope="session")
+def breaking_env():
+    """Point Maze whose episodes end early, without truncation, in about half of all cases."""
+    plain = envs.make("point_maze")
+    geometry = Geometry(
+        goal_indices=(0, 1),
+        success_radius=5.0,
+        abstract_indices=(0, 1),
+        space=((-4.0, -4.0), (20.0, 20.0)),
+        region_cuts=((8.0,), (8.0,)),
+        subgoal_scale=(10.0, 10.0),
+    )
+    goals = Goals(lower=(-4.0, -4.0), upper=(20.0, 20.0))
+    env = MazeEnv("breaking", plain.arena, Fused(plain.body), goals, geometry, episode_length=EPISODE)
+    return envs.VectorEnv(env, NUM_ENVS, auto_reset=False)
+
+
+def record(agent, spec, env, state, key):
+    """Every intermediate value of one episode, segment by segment; leading axis [segments]."""
+
+    def segment(streams, key):
+        command_key, tutor_key, rollout_key, reset_key = jax.random.split(key, 4)
+        allowed = episode.successors(agent, state)
+        before = streams
+        commanded = episode.command(agent, spec, state, allowed, before, epsilon=0.5, key=command_key)
+        subgoal, action = episode.choose_subgoal(agent, spec, state, commanded, deterministic=False, key=tutor_key)
+        rolled, steps = episode.rollout(
+            agent, spec, env, state, commanded, subgoal, deterministic=False, key=rollout_key
+        )
+        advanced = episode.advance(agent, rolled)
+        decision, outcome = hierarchy._finished_period(agent, spec, state, advanced, steps)
+        saved = {
+            "before": before,
+            "commanded": commanded,
+            "subgoal": subgoal,
+            "rolled": rolled,
+            "steps": steps,
+            "advanced": advanced,
+            "decision": decision,
+            "outcome": outcome,
+            "tutor": hierarchy._tutor_transition(agent, spec, advanced, before.env.obs, action, steps),
+            "controller": hierarchy._controller_rollout(agent, spec, steps),
+        }
+        return episode.restart_ended(agent, env, advanced, steps, key=reset_key), saved
+
+    start_key, scan_key = jax.random.split(key)
+    streams = episode.start(spec, env, state.abstraction, key=start_key)
+    keys = jax.random.split(scan_key, spec.episode_length // agent.tutor.period)
+    last, saved = jax.lax.scan(segment, streams, keys)
+    return last, saved
+
+
+@pytest.fixture(scope="session", params=["published", "ours"])
+def recording(request, breaking_env):
+    """One recorded episode of the tiny hierarchy, as NumPy arrays, with what is needed to check it."""
+    published = request.param == "published"
+    overrides = {
+        "commander.reward": "max" if published else "mean",
+        "tutor.reward": "distance" if published else "progress",
+        "controller.reward": "distance" if published else "progress",
+        "tutor.relative_bounds": not published,
+        "tutor.reward_scale": 0.1,
+        "controller.reward_scale": 0.5,
+    }
+    parsed = config.parse(TINY, overrides)
+    agent, spec = parsed.agent(), star.state.Spec.of(breaking_env.env)
+
+    def whole(key):
+        state = star.state.init(agent, spec, key=key)
+        # Greedy choices often fall on the goal's own region.
+        eye = jnp.eye(state.abstraction.capacity)
+        state = state.replace(commander=state.commander.replace(q=jnp.broadcast_to(eye, state.commander.q.shape)))
+        return state.abstraction, record(agent, spec, breaking_env, state, key)
+
+    abstraction, (last, saved) = to_numpy(jax.jit(whole)(jax.random.key(1)))
+    return SimpleNamespace(config=parsed, spec=spec, abstraction=abstraction, last=last, published=published, **saved)
+
+
+def to_numpy(tree):
+    """The tree with NumPy arrays, typed keys left out."""
+
+    def convert(leaf):
+        return None if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else np.asarray(leaf)
+
+    return jax.tree.map(convert, tree)

@@ -1,0 +1,296 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+import envs
+from star import trainer
+from star.cli import main, split_settings
+from star.config import Config, ConfigError, fields
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    """An empty working directory with three config files and one run."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "point.yaml").write_text("env: {name: point_maze}\ntrainer: {num_envs: 8}\n")
+    (tmp_path / "ant.yaml").write_text("env: {name: ant_maze}\ntrainer: {num_envs: 8}\n")
+    (tmp_path / "broken.yaml").write_text("tutor:\n  period: [5\ntrainer: {}\n")
+    run = tmp_path / "runs" / "old"
+    run.mkdir(parents=True)
+    (run / "config.yaml").write_text(Config().to_yaml())
+    return tmp_path
+
+
+@pytest.fixture
+def bare(monkeypatch):
+    """A machine without a GPU and without Warp."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    monkeypatch.setitem(sys.modules, "warp", None)
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """What `trainer.train` and `trainer.evaluate` are called with; neither does anything."""
+    calls = []
+
+    def train(config, run_dir, *, resume=False, quiet=False):
+        calls.append({"config": config, "run_dir": run_dir, "resume": resume, "quiet": quiet})
+        return trainer.Result(run_dir, 1_500, False, 0.25)
+
+    def evaluate(config, run_dir, *, checkpoint, seed):
+        calls.append({"config": config, "run_dir": run_dir, "checkpoint": checkpoint, "seed": seed})
+        measured = {name: 0.5 for name in ("success_any", "success_final", "distance", "return")}
+        row = {"episodes": 8} | measured | {f"{name}_interval": [0.25, 0.75] for name in measured}
+        return {"env": "point_maze", "engine": "jax", "env_steps": 10} | row | {"seeds": [{"seed": 3} | row]}
+
+    monkeypatch.setattr(trainer, "train", train)
+    monkeypatch.setattr(trainer, "evaluate", evaluate)
+    return calls
+
+
+def contents(folder):
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+def refusal(capsys, folder, arguments):
+    """What a command that fails says: exit code 2, one line on stderr, nothing on stdout, nothing written."""
+    before = contents(folder)
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and contents(folder) == before
+    assert err.startswith("error: ") and err.endswith("\n") and err.count("\n") == 1
+    return err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        pytest.param("train point.yaml --commander.perod 5", "commander.period?", id="misspelt key"),
+        pytest.param("train point.yaml --comander.period 5", "commander?", id="misspelt section"),
+        pytest.param("train point.yaml --tutor.period ten", "tutor.period: 'ten' is not allowed", id="wrong type"),
+        pytest.param("train point.yaml --tutor.ppo 5", "tutor.ppo: 5 is not allowed", id="section as a value"),
+        pytest.param("train point.yaml --commander.learning_rate nan", "finite", id="not a number"),
+        pytest.param("train point.yaml --trainer.num_envs true", "trainer.num_envs: True", id="boolean as a number"),
+        pytest.param("train point.yaml --commander.discount -1", "commander.discount: -1", id="out of range"),
+        pytest.param("train point.yaml --seeds 0", "trainer.num_seeds: 0", id="no seeds"),
+        pytest.param("train point.yaml --tutor.period 7", "not a multiple", id="periods that do not fit"),
+        pytest.param("train point.yaml --tutor.period", "--tutor.period: needs a value", id="no value"),
+        pytest.param("train point.yml", "did you mean point.yaml?", id="missing config"),
+        pytest.param("train broken.yaml", "broken.yaml: line 3", id="broken config"),
+        pytest.param("train point.yaml --bogus", "--bogus: unknown argument", id="unknown flag"),
+        pytest.param("train point.yaml --tutor 5", "--tutor: unknown argument", id="flag without a dot"),
+        pytest.param("train point.yaml more", "more: unknown argument", id="too many arguments"),
+        pytest.param("train", "either a config file or --resume", id="neither config nor resume"),
+        pytest.param("train point.yaml --resume runs/old", "either a config file or --resume", id="both"),
+        pytest.param("train --resume runs/new", "runs/new: is not a run directory", id="resume of a non-run"),
+        pytest.param("train --resume runs/old", "no checkpoint to resume from", id="resume without checkpoint"),
+        pytest.param("train --resume runs/old --run-dir a", "--run-dir", id="resume elsewhere"),
+        pytest.param("evaluate runs/new", "runs/new: is not a run directory", id="evaluate a non-run"),
+        pytest.param("evaluate runs/old", "runs/old: holds no checkpoint", id="evaluate without checkpoint"),
+        pytest.param("evaluate", "required: run", id="evaluate nothing"),
+        pytest.param("evaluate runs/old --episodes x", "trainer.eval_episodes: 'x'", id="episodes not a number"),
+        pytest.param("evaluate runs/old --evaluation-seed x", "--evaluation-seed", id="seed not a number"),
+        pytest.param("settings tutr", "tutr: no setting begins so", id="unknown prefix"),
+        pytest.param("settings --tutor.period=5", "takes no settings", id="settings with a setting"),
+        pytest.param("envs --tutor.period 5", "takes no settings", id="envs with a setting"),
+        pytest.param("trian point.yaml", "invalid choice: 'trian'", id="unknown command"),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(capsys, folder, arguments, said):
+    assert said in refusal(capsys, folder, arguments.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        pytest.param("train ant.yaml --env.engine warp", 'pip install "star-rl[warp]"', id="engine"),
+        pytest.param(
+            "train point.yaml --env.engine native", 'engine "native" is not one of point_maze', id="no engine"
+        ),
+        pytest.param("train point.yaml --trainer.device gpu", 'pip install "star-rl[cuda,warp]"', id="device"),
+        pytest.param("train point.yaml --env.name point_mase", 'did you mean "point_maze"?', id="task"),
+        pytest.param("train point.yaml --env.options.presett fast", 'option "presett"', id="option"),
+        pytest.param("train point.yaml --env.options.episode_length -5", "episode_length", id="value of an option"),
+        pytest.param("train point.yaml --abstraction.cuts [[50],[8]]", "abstraction.cuts: [50.0]", id="cuts"),
+        pytest.param("train point.yaml --tutor.unroll 7", "tutor.unroll: 7 does not divide", id="unroll"),
+    ],
+)
+def test_what_machine_or_task_cannot_do_is_one_line_and_nothing_is_written(capsys, folder, bare, arguments, said):
+    assert said in refusal(capsys, folder, [*arguments.split(), "--run-dir", "new"])
+
+
+def test_a_run_never_writes_over_another(capsys, folder):
+    (folder / "full").mkdir()
+    (folder / "full" / "thesis.txt").write_text("ten years of work")
+    message = refusal(capsys, folder, "train point.yaml --run-dir full".split())
+    assert "full: is not empty" in message and "star train --resume full" in message
+
+
+def test_a_seed_that_is_too_large_is_refused(capsys, folder):
+    assert "seed" in refusal(capsys, folder, f"train point.yaml --run-dir new --seed {2**32}".split())
+
+
+@pytest.mark.parametrize("value", ["2020-13-45", "1" * 5000])
+def test_a_value_that_yaml_chokes_on_is_refused(capsys, folder, value):
+    refusal(capsys, folder, ["train", "point.yaml", "--env.name", value])
+
+
+def test_settings_and_flags_override_the_file(calls):
+    arguments = "train point.yaml --seed 3 --seeds 2 --total-env-steps 4000 --quiet --run-dir new"
+    settings = "--tutor.ppo.hidden [32,16] --commander.learning_rate=1e-3 --tutor.reward distance --env.options.a b"
+    assert main([*arguments.split(), *settings.split()]) == 0
+    (call,) = calls
+    config = call["config"]
+    assert (config.trainer.seed, config.trainer.num_seeds, config.trainer.total_env_steps) == (3, 2, 4000)
+    assert (config.tutor.ppo.hidden, config.commander.learning_rate) == ((32, 16), 0.001)
+    assert (config.tutor.reward, config.env.options) == ("distance", {"a": "b"})
+    assert config.trainer.num_envs == 8
+    assert (call["run_dir"], call["resume"], call["quiet"]) == (Path("new"), False, True)
+
+
+def test_a_run_is_named_after_its_config_file_and_the_time(calls):
+    assert main(["train", "point.yaml"]) == 0
+    run_dir = calls[0]["run_dir"]
+    assert run_dir.parent == Path("runs") and run_dir.name.startswith("point-")
+
+
+def test_a_finished_run_says_where_its_results_are(calls, capsys):
+    assert main("train point.yaml --run-dir new".split()) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    for text in ("1,500 env steps", "0.25", "new/figures/summary.png", "new/metrics.jsonl", "star evaluate new"):
+        assert text in out
+
+
+def test_resume_goes_on_in_the_same_directory_with_its_config(calls):
+    assert main("train --resume runs/old --total-env-steps 9000".split()) == 0
+    (call,) = calls
+    assert (call["run_dir"], call["resume"]) == (Path("runs/old"), True)
+    assert call["config"].trainer.total_env_steps == 9000
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "train --resume runs/old --tutor.reward_scale 2",
+        "train --tutor.reward_scale 2 point.yaml",
+        "evaluate --tutor.reward_scale 2 runs/old",
+    ],
+)
+def test_settings_may_stand_anywhere(calls, arguments):
+    assert main(arguments.split()) == 0
+    assert calls[0]["config"].tutor.reward_scale == 2.0
+
+
+def test_an_interrupted_run_says_how_to_go_on(monkeypatch, capsys):
+    monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 500, True, None))
+    assert main("train point.yaml --run-dir new".split()) == 130
+    assert "star train --resume new" in capsys.readouterr().out
+
+
+def test_a_second_interrupt_ends_without_a_traceback(monkeypatch, capsys):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(trainer, "train", interrupted)
+    assert main(["train", "point.yaml"]) == 130
+    assert capsys.readouterr().err == ""
+
+
+def test_evaluate_prints_every_measure_with_its_interval(calls, capsys):
+    assert main("evaluate runs/old --episodes 7 --checkpoint best --evaluation-seed 4".split()) == 0
+    out = capsys.readouterr().out
+    assert "seed 3: 8 episodes" in out and "success_final 0.500 [0.250, 0.750]" in out
+    (call,) = calls
+    assert (call["run_dir"], call["checkpoint"], call["seed"]) == (Path("runs/old"), "best", 4)
+    assert call["config"].trainer.eval_episodes == 7
+
+
+def test_evaluate_prints_json_on_request(calls, capsys):
+    assert main("evaluate runs/old --json".split()) == 0
+    assert json.loads(capsys.readouterr().out)["seeds"][0]["seed"] == 3
+
+
+def test_evaluate_takes_the_engine_of_this_machine(calls, folder):
+    (folder / "runs" / "old" / "config.yaml").write_text("env: {name: ant_maze, engine: warp}")
+    assert main("evaluate runs/old".split()) == 0
+    assert calls[0]["config"].env.engine == "auto"
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_help_shows_how_to_train_resume_and_evaluate(capsys, arguments):
+    try:
+        code = main(arguments)
+    except SystemExit as end:
+        code = end.code
+    out, err = capsys.readouterr()
+    assert (code, err) == (0, "")
+    for text in ("star train configs/", "--resume", "star evaluate", "star envs", "star settings"):
+        assert text in out
+
+
+def test_settings_lists_every_key_with_its_default(capsys):
+    assert main(["settings"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == [key for key, _, _ in fields()]
+    for line, (_, default, description) in zip(lines, fields(), strict=True):
+        assert line.endswith(f"{description} (default {json.dumps(default)})")
+
+
+def test_settings_can_be_narrowed_down(capsys):
+    assert main(["settings", "tutor.ppo"]) == 0
+    keys = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
+    assert keys == [key for key, _, _ in fields() if key.startswith("tutor.ppo.")]
+
+
+def test_envs_lists_every_task(capsys):
+    assert main(["envs"]) == 0
+    assert capsys.readouterr().out.split() == list(envs.names())
+
+
+@pytest.mark.parametrize(
+    ("value", "read"),
+    [
+        ("1e-3", "1e-3"),  # text to YAML 1.1; the section makes it a number
+        ("0.5", 0.5),
+        ("5", 5),
+        ("true", True),
+        ("null", None),
+        ("[1, 2]", [1, 2]),
+        ("[[4, 8], []]", [[4, 8], []]),
+        ("a=b", "a=b"),
+        ("-1", -1),
+        ("[1", "[1"),
+    ],
+)
+def test_values_are_read_as_yaml(value, read):
+    assert split_settings(["--a.b", value]) == split_settings([f"--a.b={value}"]) == ([], {"a.b": read})
+
+
+def test_of_two_values_the_last_one_counts():
+    assert split_settings("--a.b 1 --a.b 2".split()) == ([], {"a.b": 2})
+
+
+@pytest.mark.parametrize("arguments", ["a.b 1", "--ab 1", "-a.b 1"])
+def test_what_is_no_setting_is_left_to_the_command(arguments):
+    assert split_settings(arguments.split()) == (arguments.split(), {})
+
+
+def test_a_setting_without_a_value_is_refused():
+    with pytest.raises(ConfigError, match="needs a value"):
+        split_settings(["--a.b"])
+
+
+def test_the_program_itself_prints_help_and_no_warnings():
+    command = [sys.executable, "-W", "default", "-m", "star.cli", "--help"]
+    where = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | where, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("usage: star")

@@ -1,0 +1,307 @@
+import json
+
+import jax
+import jax.numpy as jnp
+import pytest
+from pydantic import ValidationError
+
+from star.config import Config, ConfigError, fields, load, parse
+
+DEFAULTS = {key: default for key, default, _ in fields()}
+
+
+@pytest.fixture
+def write(tmp_path):
+    """Writes a file of that text and returns its path."""
+
+    def write(text, name="maze.yaml"):
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def refusal(*args, **kwargs):
+    """The message of the ConfigError that `load` raises; always one line."""
+    with pytest.raises(ConfigError) as caught:
+        load(*args, **kwargs)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def lookup(config, dotted):
+    for part in dotted.split("."):
+        config = getattr(config, part)
+    return config
+
+
+def test_an_empty_file_means_the_defaults(write):
+    assert load(write("")) == load(write("# nothing\n")) == Config()
+
+
+def test_sections_of_the_file_replace_only_the_keys_they_name(write):
+    config = load(write("tutor: {period: 15, ppo: {hidden: [64, 64]}}"))
+    assert (config.tutor.period, config.tutor.ppo.hidden) == (15, (64, 64))
+    assert config.tutor.ppo.clip == DEFAULTS["tutor.ppo.clip"]
+    assert config.controller == Config().controller
+
+
+@pytest.mark.parametrize("text", ["1e-3", "1.0e-3", ".001"])
+def test_a_float_may_be_written_in_any_usual_way(write, text):
+    assert load(write(f"commander: {{learning_rate: {text}}}")).commander.learning_rate == 0.001
+
+
+def test_a_whole_number_is_a_float_where_one_is_wanted(write):
+    value = load(write("tutor: {reward_scale: 2}")).tutor.reward_scale
+    assert (type(value), value) == (float, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong", "nearest"),
+    [
+        ("comander: {}", "comander", "commander"),
+        ("commander: {perod: 5}", "commander.perod", "commander.period"),
+        ("tutor: {ppo: {hiden: [8]}}", "tutor.ppo.hiden", "tutor.ppo.hidden"),
+        ("trainer: {max_regions: 8}", "trainer.max_regions", "abstraction.max_regions"),
+    ],
+)
+def test_a_misspelt_key_names_the_nearest_valid_one(write, text, wrong, nearest):
+    path = write(text)
+    assert refusal(path) == f"{path}: {wrong}: unknown key (did you mean {nearest}?)"
+
+
+def test_a_key_like_no_other_lists_those_of_its_section(write):
+    message = refusal(write("abstraction: {zzz: 1}"))
+    assert message.endswith("abstraction.zzz: unknown key (allowed: max_regions, cuts, min_width)")
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "value", "allowed"),
+    [
+        ("trainer: {num_envs: many}", "trainer.num_envs", "'many'", "integer"),
+        ("trainer: {num_envs: 1.5}", "trainer.num_envs", "1.5", "integer"),
+        ("trainer: {seed: 2020-01-01}", "trainer.seed", "2020", "integer"),
+        ("tutor: {reward_scale: [1]}", "tutor.reward_scale", "[1]", "number"),
+        ("tutor: {relative_bounds: maybe}", "tutor.relative_bounds", "'maybe'", "boolean"),
+        ("tutor: {ppo: {hidden: 64}}", "tutor.ppo.hidden", "64", "tuple"),
+        ("tutor: {ppo: {hidden: [64, x]}}", "tutor.ppo.hidden.1", "'x'", "integer"),
+        ("tutor: 5", "tutor", "5", "dictionary"),
+        ("tutor:", "tutor", "None", "dictionary"),
+        ("env: {options: fast}", "env.options", "'fast'", "dictionary"),
+    ],
+)
+def test_a_wrong_type_names_key_value_and_what_is_allowed(write, text, key, value, allowed):
+    message = refusal(write(text))
+    assert f" {key}: " in message and value in message and allowed in message
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "allowed"),
+    [
+        ("trainer: {num_envs: 0}", "trainer.num_envs: 0", "greater than 0"),
+        ("trainer: {seed: -1}", "trainer.seed: -1", "greater than or equal to 0"),
+        ("commander: {discount: 1}", "commander.discount: 1", "less than 1"),
+        ("commander: {epsilon_end: 1.1}", "commander.epsilon_end: 1.1", "less than or equal to 1"),
+        ("abstraction: {max_regions: 5000}", "abstraction.max_regions: 5000", "less than or equal to 1024"),
+        ("refinement: {depth: 9}", "refinement.depth: 9", "less than or equal to 8"),
+        ("tutor: {learner: sac}", "tutor.learner: 'sac'", "'ppo' or 'td3'"),
+        ("commander: {successors: all}", "commander.successors: 'all'", "'any', 'possible' or 'known'"),
+    ],
+)
+def test_a_value_out_of_range_names_the_range(write, text, key, allowed):
+    message = refusal(write(text))
+    assert f" {key} is not allowed" in message and allowed in message
+
+
+@pytest.mark.parametrize("value", [".nan", ".inf", "-.inf", "nan"])
+@pytest.mark.parametrize("key", ["commander.epsilon_steps", "tutor.reward_scale"])
+def test_numbers_must_be_finite(write, key, value):
+    section, name = key.split(".")
+    assert f"{key}: " in refusal(write(f"{section}: {{{name}: {value}}}"))
+
+
+@pytest.mark.parametrize("key", ["trainer.num_envs", "trainer.seed", "tutor.reward_scale", "refinement.depth"])
+@pytest.mark.parametrize("value", [True, False])
+def test_booleans_are_not_numbers(key, value):
+    with pytest.raises(ConfigError, match=rf"{key}: {value} is not allowed: should be a number"):
+        parse({}, {key: value})
+
+
+@pytest.mark.parametrize(
+    ("values", "key"),
+    [
+        ({"commander": {"period": 30}, "tutor": {"period": 7}}, "commander.period: 30"),
+        ({"tutor": {"off_policy_correction": True}}, "tutor: off_policy_correction needs learner td3"),
+        ({"trainer": {"num_envs": 8}, "controller": {"ppo": {"minibatches": 7}}}, "controller.ppo.minibatches: 7"),
+    ],
+)
+def test_values_that_do_not_fit_together_are_refused(values, key):
+    with pytest.raises(ConfigError, match=key):
+        parse(values)
+
+
+def test_the_first_of_several_errors_is_told(write):
+    message = refusal(write("env: {nam: x}\ntrainer: {num_envs: 0}"))
+    assert "env.nam" in message and "num_envs" not in message
+
+
+def test_a_long_value_is_cut_short(write):
+    assert len(refusal(write(f"tutor: {{learner: {'x' * 5000}}}"))) < 300
+
+
+def test_a_missing_file_names_the_nearest_one(write, tmp_path):
+    write("", "point_maze.yaml")
+    wanted = tmp_path / "pointmaze.yml"
+    assert refusal(wanted) == f"{wanted}: no such file (did you mean {tmp_path / 'point_maze.yaml'}?)"
+
+
+def test_a_missing_file_like_no_other_is_only_missing(tmp_path):
+    for path in (tmp_path / "maze.yaml", tmp_path / "nowhere" / "maze.yaml"):
+        assert refusal(path) == f"{path}: no such file"
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [("tutor:\n  period: [5\ntrainer: {}\n", 3), ("tutor:\n\tperiod: 5\n", 2), ("tutor: !!python/none x\n", 1)],
+)
+def test_a_syntax_error_names_its_line(write, text, line):
+    path = write(text)
+    message = refusal(path)
+    assert message.startswith(f"{path}: line {line} column ") and "not valid YAML" in message
+
+
+@pytest.mark.parametrize("text", ["- 1\n- 2\n", "tutor\n", "5\n"])
+def test_a_file_that_is_no_mapping_is_refused(write, text):
+    assert "should hold sections such as `trainer:`" in refusal(write(text))
+
+
+@pytest.mark.parametrize("text", ["1: 2\n", "tutor: {1: 2}\n", "env: {options: {1: 2}}\n"])
+def test_keys_are_strings(write, text):
+    assert "string" in refusal(write(text))
+
+
+@pytest.mark.parametrize("text", ["tutor: {period: 5}\ntutor: {unroll: 1}\n", "tutor:\n  period: 5\n  period: 10\n"])
+def test_a_key_given_twice_is_refused(write, text):
+    assert "twice" in refusal(write(text))
+
+
+def test_what_is_not_text_is_refused(tmp_path):
+    binary, folder = tmp_path / "binary.yaml", tmp_path / "folder.yaml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    folder.mkdir()
+    assert "not UTF-8 text" in refusal(binary)
+    assert "cannot be read" in refusal(folder)
+
+
+@pytest.mark.parametrize("text", ["[" * 3000, "trainer: {seed: " + "1" * 5000 + "}"])
+def test_absurd_yaml_is_refused_in_one_line(write, text):
+    assert "not valid YAML" in refusal(write(text))
+
+
+def test_overrides_win_over_the_file_at_any_depth(write):
+    path = write("tutor: {period: 15, ppo: {clip: 0.3, passes: 2}}")
+    config = load(path, {"tutor.period": 5, "tutor.ppo.clip": 0.1, "env.options.episode_length": 100})
+    assert (config.tutor.period, config.tutor.ppo.clip, config.tutor.ppo.passes) == (5, 0.1, 2)
+    assert config.env.options == {"episode_length": 100}
+
+
+def test_overrides_may_be_lists_and_text_that_is_a_number():
+    config = parse({}, {"tutor.ppo.hidden": [32, 16], "abstraction.cuts": [[4, 8.5], []], "commander.discount": "1e-3"})
+    assert config.tutor.ppo.hidden == (32, 16)
+    assert config.abstraction.cuts == ((4.0, 8.5), ())
+    assert config.commander.discount == 0.001
+
+
+def test_overrides_leave_the_values_they_were_given_alone():
+    values = {"tutor": {"ppo": {"clip": 0.3}}}
+    parse(values, {"tutor.ppo.clip": 0.1, "tutor.period": 5})
+    assert values == {"tutor": {"ppo": {"clip": 0.3}}}
+
+
+def test_a_misspelt_override_names_the_nearest_key():
+    with pytest.raises(ConfigError, match=r"tutor.ppo.clp: unknown key \(did you mean tutor.ppo.clip\?\)"):
+        parse({}, {"tutor.ppo.clp": 1})
+
+
+def test_a_configuration_is_frozen():
+    config = Config()
+    with pytest.raises(ValidationError, match="frozen"):
+        config.tutor = Config().tutor
+    with pytest.raises(ValidationError, match="frozen"):
+        config.tutor.ppo.clip = 0.3
+
+
+def test_yaml_of_a_configuration_parses_to_an_equal_one(write):
+    config = parse(
+        {},
+        {
+            "abstraction.cuts": [[1.5], [2, 3]],
+            "commander.learning_rate": 1e-7,
+            "tutor.ppo.hidden": [8],
+            "tutor.learner": "td3",
+            "env.options": {"preset": "published", "timestep": 0.01},
+        },
+    )
+    for one in (Config(), config):
+        assert load(write(one.to_yaml())) == one
+        assert parse(json.loads(one.model_dump_json())) == one
+
+
+def test_yaml_holds_every_setting():
+    stored = Config().to_yaml()
+    assert all(f"{key.rsplit('.', 1)[-1]}:" in stored for key in DEFAULTS)
+
+
+def test_fields_lists_every_setting_with_its_default_and_meaning():
+    config = Config()
+    for key, default, description in fields():
+        assert lookup(config, key) == default
+        assert description
+    assert {"env.name", "tutor.ppo.hidden", "trainer.num_seeds"} <= set(DEFAULTS)
+
+
+def test_every_shipped_file_is_valid_and_names_a_task(pytestconfig):
+    import envs
+
+    paths = sorted((pytestconfig.rootpath / "configs").rglob("*.yaml"))
+    assert paths
+    for path in paths:
+        assert load(path).env.name in envs.names()
+
+
+def test_the_leaves_are_exactly_the_floats():
+    found = {
+        "".join(str(k) for k in path).lstrip("."): leaf
+        for path, leaf in jax.tree_util.tree_flatten_with_path(Config())[0]
+    }
+    assert found == {key: default for key, default in DEFAULTS.items() if isinstance(default, float)}
+
+
+def test_the_agent_holds_neither_task_nor_trainer():
+    agent = Config().agent()
+    assert set(type(agent).model_fields) == set(Config.model_fields) - {"env", "trainer"}
+    assert agent.tutor == Config().tutor
+
+
+def test_floats_are_values_and_the_rest_is_structure():
+    plain = jax.tree.structure(Config().agent())
+    assert jax.tree.structure(parse({}, {"commander.learning_rate": 0.5}).agent()) == plain
+    for change in ({"tutor.period": 5}, {"tutor.ppo.hidden": [8]}, {"refinement.enabled": False}):
+        changed = parse({}, change).agent()
+        assert jax.tree.structure(changed) != plain
+        assert hash(jax.tree.structure(changed)) is not None
+
+
+def test_flattening_and_back_is_the_identity():
+    config = parse({}, {"abstraction.cuts": [[1.5], [2, 3]], "tutor.learner": "td3"})
+    leaves, structure = jax.tree.flatten(config)
+    assert jax.tree.unflatten(structure, leaves) == config
+
+
+def test_several_values_of_a_float_run_under_one_vmap():
+    agents = [parse({}, {"commander.learning_rate": rate}).agent() for rate in (0.1, 0.2)]
+    stacked = jax.tree.map(lambda *leaves: jnp.array(leaves), *agents)
+    doubled = jax.vmap(lambda agent: 2 * agent.commander.learning_rate + agent.tutor.period)(stacked)
+    assert doubled.tolist() == pytest.approx([10.2, 10.4])

@@ -1,0 +1,166 @@
+import itertools
+import json
+import re
+import shlex
+from pathlib import Path
+
+import jax
+import pytest
+
+import envs
+from star import trainer
+from star.cli import main
+from star.config import Config, fields, parse
+
+ROOT = Path(__file__).parents[1]
+PAGES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("docs/*.md"))}
+PAGES["README.md"] = (ROOT / "README.md").read_text(encoding="utf-8")
+DEFAULTS = {key: default for key, default, _ in fields()}
+WRITTEN_BY_THE_TRAINER = {"seed", "env_steps", "wall_s", "env_steps_per_s"} | {
+    f"eval/{name}" for name in ("success_any", "success_final", "distance", "return")
+}
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", PAGES[page], re.DOTALL | re.MULTILINE)
+
+
+def inline(text):
+    """Inline code outside of fenced blocks."""
+    return re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE))
+
+
+def rows(page):
+    """Cells of the table rows whose first cell is inline code: [[code, cell, ...], ...]."""
+    found = re.findall(r"^\| `([^`]+)`[^|]*\|(.*)\|$", PAGES[page], re.MULTILINE)
+    return [[first, *(cell.strip() for cell in rest.split("|"))] for first, rest in found]
+
+
+def commands():
+    """Every command line that begins with `star` or `make`, as (page, words); not the bare names of commands."""
+    for page, text in PAGES.items():
+        lines = [line for block in blocks(page, "bash") for line in block.replace("\\\n", " ").splitlines()]
+        for line in lines + [code for code in inline(text) if code not in ("star train", "star evaluate")]:
+            if re.match(r"(star|make) \S", line):
+                yield page, shlex.split(line, comments=True)
+
+
+COMMANDS = [pytest.param(words, id=" ".join([page, *words])[:90]) for page, words in commands()]
+STAR = [one for one in COMMANDS if one.values[0][0] == "star"]
+MAKE = [one for one in COMMANDS if one.values[0][0] == "make"]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working directory with the shipped config files, in which no command really trains."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "configs").symlink_to(ROOT / "configs")
+    monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
+    report = {"env": "", "engine": "", "env_steps": 0, "seeds": []}
+    monkeypatch.setattr(trainer, "evaluate", lambda config, run_dir, **_: report)
+    return tmp_path
+
+
+@pytest.mark.parametrize("words", STAR)
+def test_every_command_line_of_the_pages_is_accepted(words, folder):
+    for run in (word for word in words if word.startswith("runs/")):
+        (folder / run).mkdir(parents=True)
+        (folder / run / "config.yaml").write_text(Config().to_yaml())
+    assert main(words[1:]) == 0
+
+
+def test_the_pages_show_how_to_train_resume_evaluate_and_look_things_up():
+    shown = {tuple(one.values[0][1:3]) for one in STAR}
+    assert ("train", "configs/point_maze.yaml") in shown and ("train", "--resume") in shown
+    assert {"train", "evaluate", "settings", "envs"} == {words[0] for words in shown}
+
+
+@pytest.mark.parametrize("words", MAKE)
+def test_every_make_target_of_the_pages_exists(words):
+    targets = re.findall(r"^([a-z]+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert words[1] in targets
+
+
+def test_the_readme_begins_with_its_two_commands():
+    first = blocks("README.md", "bash")[0]
+    assert [line.split("#")[0].strip() for line in first.splitlines()] == ["make quickstart", "make test"]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_to_files_and_headings(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", PAGES[page]):
+        if re.match(r"https?:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        path = ((ROOT / page).parent / name).resolve() if name else ROOT / page
+        assert path.exists(), target
+        if anchor:
+            text = path.read_text(encoding="utf-8")
+            headings = {re.sub(r"[^\w]+", "-", h.strip().lower()) for h in re.findall(r"^#+ (.*)$", text, re.MULTILINE)}
+            assert anchor in headings | set(re.findall(r"^::: (\S+)$", text, re.MULTILINE)), target
+
+
+def test_the_navigation_lists_every_page():
+    navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for page in PAGES:
+        assert page == "README.md" or re.search(rf": {Path(page).name}$", navigation, re.MULTILINE), page
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_settings_named_on_a_page_exist(page):
+    known = set(DEFAULTS) | {key.rsplit(".", 1)[0] for key in DEFAULTS} | set(Config.model_fields)
+    pattern = rf"(?:--)?((?:{'|'.join(Config.model_fields)})\.[a-z0-9_.]+)"
+    for code in inline(PAGES[page]):
+        named = re.fullmatch(pattern, code.split(" ")[0])
+        if named and not named[1].endswith(".py"):
+            assert named[1] in known or named[1].startswith("env.options."), code
+
+
+def test_the_list_of_settings_is_what_the_command_prints(capsys):
+    assert main(["settings"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    (listed,) = (block.splitlines() for block in blocks("docs/configuration.md", "text"))
+    for shown, real in itertools.zip_longest(listed, printed):
+        assert shown == real, "put the output of `star settings` into docs/configuration.md"
+
+
+def test_departures_name_the_settings_and_their_defaults():
+    table = [row for row in rows("docs/departures.md") if len(row) == 4]
+    assert len(table) >= 20
+    for key, published, ours, _ in table:
+        if key.startswith("env.options."):
+            default = envs.tasks.ANT_OPTIONS[key.removeprefix("env.options.")].default
+        else:
+            default = DEFAULTS[key]
+        assert ours == f"`{json.dumps(default)}`", key
+        assert published not in (ours, ""), key
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        pytest.param({}, id="ppo"),
+        pytest.param({"tutor.learner": "td3", "controller.learner": "td3", "commander.sweeps": 0}, id="td3"),
+    ],
+)
+def test_every_metric_is_explained_and_every_explained_metric_exists(overrides):
+    program = trainer.build(parse({"env": {"name": "point_maze"}, "trainer": {"num_envs": 8}}, overrides))
+    state = jax.eval_shape(program.init, trainer.seed_keys(program))
+    metrics = set(jax.eval_shape(program.epoch, state)[1])
+    learner = {"PPO", "both"} if not overrides else {"TD3", "both"}
+    explained = {
+        key
+        for key, second, *_ in rows("docs/metrics.md")
+        if not key.startswith(("tutor/", "controller/")) or second in learner
+    }
+    assert explained == metrics | WRITTEN_BY_THE_TRAINER
+
+
+def test_the_example_of_the_metrics_page_runs(folder):
+    (folder / "runs" / "quickstart").mkdir(parents=True)
+    lines = [{"env_steps": 1}, {"env_steps": 2, "eval/success_final": 0.5}]
+    (folder / "runs/quickstart/metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (example,) = blocks("docs/metrics.md", "python")
+    names: dict = {}
+    exec(example, names)
+    assert names["curve"] == [(2, 0.5)]

@@ -1,0 +1,195 @@
+"""The clocks of the levels, the moving subgoal and the statistics, against loops written from the equations."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from star import abstraction as regions
+from star import config, episode
+from star.state import Spec
+
+K, L, B = 6, 3, 8  # commander.period, tutor.period and the environments of the recording
+
+
+def streams_and_segments(recording):
+    segments = recording.subgoal.shape[0]
+    return [(i, b) for i in range(segments) for b in range(B)]
+
+
+def ended(recording, i, b):
+    """Whether environment b terminated in segment i."""
+    return any(recording.steps.terminated[i, t, b] * recording.steps.alive[i, t, b] for t in range(L))
+
+
+def slow_locate(abstraction, point):
+    for j in range(int(abstraction.count)):
+        if all(abstraction.lower[j] <= point) and all(point < abstraction.upper[j]):
+            return j
+    raise AssertionError("outside the space")
+
+
+def test_the_recording_shows_everything_that_the_tests_below_are_about(recording):
+    ends = [ended(recording, i, b) for i, b in streams_and_segments(recording)]
+    assert any(ends) and not all(ends)
+    over = recording.steps.terminated * recording.steps.alive  # ends in either segment and at the end of a period
+    assert over[:, 1].any() and over[:, 0].any() and over[:, 2].any()
+    assert len(np.unique(recording.decision.region)) > 2
+    at_goal = recording.commanded.target == recording.commanded.goal_region
+    assert at_goal.any() and not at_goal.all()
+
+
+def test_the_clock_counts_env_steps_modulo_k_and_restarts_with_the_episode(recording):
+    clock = np.zeros(B, int)
+    for i in range(len(recording.subgoal)):
+        np.testing.assert_array_equal(recording.before.clock[i], clock)
+        clock = (clock + L) % K
+        for b in range(B):
+            if ended(recording, i, b):
+                clock[b] = 0
+    np.testing.assert_array_equal(recording.last.clock, clock)
+
+
+def test_target_and_box_change_only_where_the_clock_is_0(recording):
+    before, after = recording.before, recording.commanded
+    going_on = before.clock != 0
+    assert going_on.any()
+    for old, new in (
+        (before.target, after.target),
+        (before.box.lower, after.box.lower),
+        (before.box.upper, after.box.upper),
+        (before.start, after.start),
+        (before.region, after.region),
+        (before.reward, after.reward),
+    ):
+        np.testing.assert_array_equal(old[going_on], new[going_on])
+
+
+def test_a_decision_starts_from_the_regions_of_state_and_goal(recording):
+    for i, b in streams_and_segments(recording):
+        if recording.before.clock[i, b] == 0:
+            obs = recording.before.env.obs[i, b]
+            assert recording.commanded.region[i, b] == slow_locate(recording.abstraction, obs[:2])
+            assert recording.commanded.goal_region[i, b] == slow_locate(recording.abstraction, obs[4:6])
+            np.testing.assert_array_equal(recording.commanded.start[i, b], obs[:2])
+
+
+def test_the_box_is_the_region_or_the_surroundings_of_the_goal_in_its_own_region(recording):
+    margin = recording.config.commander.goal_margin
+    for i, b in streams_and_segments(recording):
+        target, goal = recording.commanded.target[i, b], recording.before.env.obs[i, b, 4:6]
+        lower, upper = recording.abstraction.lower[target], recording.abstraction.upper[target]
+        if target == recording.commanded.goal_region[i, b]:
+            lower, upper = goal - margin, goal + margin
+        np.testing.assert_allclose(recording.commanded.box.lower[i, b], lower, rtol=1e-6)
+        np.testing.assert_allclose(recording.commanded.box.upper[i, b], upper, rtol=1e-6)
+
+
+def test_targets_are_active_regions(recording):
+    assert recording.commanded.target.max() < recording.abstraction.count
+
+
+def test_the_subgoal_moves_with_the_agent(recording):
+    assert np.abs(recording.subgoal).max() <= 10
+    for i, b in streams_and_segments(recording):
+        g = recording.subgoal[i, b]
+        for t in range(L):
+            s, after = recording.steps.obs[i, t, b, :2], recording.steps.next_obs[i, t, b, :2]
+            np.testing.assert_allclose(recording.steps.subgoal[i, t, b], g, atol=1e-5)
+            g = s + g - after
+            np.testing.assert_allclose(recording.steps.next_subgoal[i, t, b], g, atol=1e-5)
+
+
+def test_the_tutor_decides_once_in_l_steps_from_what_the_environment_shows(recording):
+    np.testing.assert_array_equal(recording.steps.obs[:, 0], recording.before.env.obs)
+    np.testing.assert_array_equal(recording.steps.obs[:, 1:], recording.steps.next_obs[:, :-1])
+    np.testing.assert_array_equal(recording.rolled.env.obs, recording.steps.next_obs[:, -1])
+    clipped = np.clip(recording.tutor.action, -1, 1) * np.array(recording.spec.subgoal_scale)
+    np.testing.assert_allclose(recording.subgoal, clipped, rtol=1e-6)
+
+
+def test_the_commander_is_paid_the_max_or_the_mean_of_the_external_reward_over_its_k_steps(recording):
+    total = [[] for _ in range(B)]
+    for i, b in streams_and_segments(recording):
+        if recording.before.clock[i, b] == 0:
+            total[b] = []
+        total[b] += [recording.steps.reward[i, t, b] for t in range(L) if recording.steps.alive[i, t, b]]
+        expected = max(total[b]) if recording.published else sum(total[b]) / K
+        np.testing.assert_allclose(recording.rolled.reward[i, b], expected, rtol=1e-5)
+
+
+def test_the_external_reward_is_minus_the_distance_to_the_goal(recording):
+    next_obs = recording.steps.next_obs
+    distance = np.linalg.norm(next_obs[..., :2] - next_obs[..., 4:6], axis=-1)
+    np.testing.assert_allclose(recording.steps.reward, -distance, rtol=1e-5)
+
+
+def test_an_environment_that_ended_waits_for_the_end_of_the_segment(recording):
+    waited = 0
+    for i, b in streams_and_segments(recording):
+        alive = 1.0
+        for t in range(L):
+            assert recording.steps.alive[i, t, b] == alive
+            if recording.steps.terminated[i, t, b]:
+                alive = 0.0
+            elif not alive:
+                pytest.fail("an ended environment went on without a reset")
+        if not alive:
+            waited += 1
+            last = int(recording.steps.alive[i, :, b].sum()) - 1
+            rest = recording.steps.next_obs[i, last:, b]
+            np.testing.assert_array_equal(rest, np.broadcast_to(rest[0], rest.shape))
+    assert waited
+
+
+def test_an_environment_that_ended_is_reset_and_no_other_is(recording):
+    for i, b in streams_and_segments(recording):
+        if i + 1 == len(recording.subgoal):
+            continue
+        now, before = recording.before.env.obs[i + 1, b], recording.rolled.env.obs[i, b]
+        if ended(recording, i, b):
+            assert np.abs(now[:2]).max() <= 0.1
+            assert (now[4:6] != before[4:6]).all()
+            assert recording.before.env.info["steps"][i + 1, b] == 0
+        else:
+            np.testing.assert_array_equal(now, before)
+
+
+def test_episode_statistics_are_those_of_the_steps_since_the_last_reset(recording):
+    any_, total = np.zeros(B), np.zeros(B)
+    for i, b in streams_and_segments(recording):
+        for t in range(L):
+            if recording.steps.alive[i, t, b]:
+                obs = recording.steps.next_obs[i, t, b]
+                distance = np.linalg.norm(obs[:2] - obs[4:6])
+                any_[b], total[b] = max(any_[b], distance < 5), total[b] - distance
+                final = float(distance < 5)
+        seen = recording.advanced.episode
+        assert seen.success_any[i, b] == any_[b]
+        assert seen.success_final[i, b] == final
+        np.testing.assert_allclose(seen.distance[i, b], distance, rtol=1e-5)
+        np.testing.assert_allclose(seen.total[i, b], total[b], rtol=1e-4)
+        if ended(recording, i, b):
+            any_[b] = total[b] = 0
+    np.testing.assert_allclose(recording.last.episode.total, total, rtol=1e-4)
+
+
+def test_dimensions_that_the_goal_leaves_open_keep_the_bounds_of_the_region(tiny):
+    spec = Spec(
+        state_dim=4,
+        action_size=2,
+        episode_length=30,
+        abstract_indices=(0, 1, 3),
+        goal_indices=(1, 0),
+        subgoal_scale=(1.0, 1.0, 1.0),
+        space=((0.0, 0.0, 0.0), (8.0, 8.0, 8.0)),
+        region_cuts=((), (), (4.0,)),
+    )
+    obs = jnp.array([[1.0, 2.0, 9.0, 5.0, 7.0, 6.0]])  # state 1, 2, 9, 5; goal y = 7, x = 6
+    point = spec.goal_point(obs)
+    np.testing.assert_array_equal(point, [[6, 7, 5]])
+    np.testing.assert_array_equal(spec.abstract(obs), [[1, 2, 5]])
+    made = regions.create(spec.space, spec.region_cuts, max_regions=2)
+    region = jnp.array([1])
+    box = episode.target_box(config.parse(tiny).agent(), spec, made, region, region, point)
+    np.testing.assert_array_equal(box.lower, [[5, 6, 4]])
+    np.testing.assert_array_equal(box.upper, [[7, 8, 8]])

@@ -1,0 +1,105 @@
+"""F_k against the equations, as a network for reachability, and as a learner."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from star import config, forward_model, reachability
+from star.forward_model import Outcome
+
+SPACE = jnp.array([[-4.0, 0.0], [20.0, 10.0]])
+
+
+def settings(**values):
+    values = {"hidden": [8, 6], "batch_size": 16, "buffer_size": 32, "updates_per_epoch": 3} | values
+    return config.parse({"forward_model": values}).forward_model
+
+
+def random_outcome(n, seed=0):
+    rng = np.random.default_rng(seed)
+    start = rng.uniform(SPACE[0], SPACE[1], (n, 2)).astype(np.float32)
+    lower = rng.uniform(SPACE[0], SPACE[1], (n, 2)).astype(np.float32)
+    return Outcome(start=start, lower=lower, upper=lower + 3, end=start + 1, weight=np.ones(n, np.float32))
+
+
+def slow_predict(params, residual, start, lower, upper):
+    middle, half = np.float64(SPACE[0] + SPACE[1]) / 2, np.float64(SPACE[1] - SPACE[0]) / 2
+    x = np.concatenate([(start - middle) / half, (lower - middle) / half, (upper - middle) / half])
+    layers = params["params"]
+    for i in range(3):
+        x = x @ np.float64(layers[f"Dense_{i}"]["kernel"]) + np.float64(layers[f"Dense_{i}"]["bias"])
+        x = np.maximum(x, 0) if i < 2 else x
+    return (start if residual else middle) + half * x
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["residual", "absolute"])
+def model(request):
+    chosen = settings(residual=request.param)
+    state = jax.jit(lambda key: forward_model.init(key, chosen, space=SPACE))(jax.random.key(0))
+    noisy = jax.tree.map(lambda p: p + 0.1, state.params)  # biases start at 0, where they could hide
+    return chosen, state.replace(params=noisy)
+
+
+@pytest.fixture(scope="module")
+def train():
+    return jax.jit(lambda chosen, state, fresh, key: forward_model.train(chosen, state, fresh, key=key))
+
+
+def test_predictions_follow_the_equation(model):
+    chosen, state = model
+    batch = random_outcome(20)
+    predicted = jax.jit(forward_model.predict)(chosen, state, batch.start, batch.lower, batch.upper)
+    for n in range(20):
+        expected = slow_predict(state.params, chosen.residual, batch.start[n], batch.lower[n], batch.upper[n])
+        np.testing.assert_allclose(predicted[n], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_errors_are_squared_distances_to_where_the_period_ended(model):
+    chosen, state = model
+    batch = random_outcome(20)
+    errors = jax.jit(forward_model.errors)(chosen, state, batch)
+    for n in range(20):
+        predicted = slow_predict(state.params, chosen.residual, batch.start[n], batch.lower[n], batch.upper[n])
+        np.testing.assert_allclose(errors[n], ((predicted - batch.end[n]) ** 2).sum(), rtol=1e-3)
+
+
+def test_the_network_of_a_box_predicts_the_same(model):
+    chosen, state = model
+    batch = random_outcome(20)
+    network = forward_model.network(chosen, state, batch.lower[0], batch.upper[0])
+    low, high = jax.jit(jax.vmap(reachability.hull, in_axes=(None, 0, 0)))(network, batch.start, batch.start)
+    for n in range(20):
+        expected = slow_predict(state.params, chosen.residual, batch.start[n], batch.lower[0], batch.upper[0])
+        np.testing.assert_allclose((low[n] + high[n]) / 2, expected, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(low[n], high[n], atol=1e-2)  # a point's hull is a point but for rounding
+
+
+def test_training_learns_where_each_commanded_box_leads(train):
+    chosen = settings(batch_size=64, buffer_size=256, updates_per_epoch=400, learning_rate=0.01)
+    state = forward_model.init(jax.random.key(0), chosen, space=SPACE)
+    batch = random_outcome(256)
+    batch = batch.replace(end=batch.start + np.where(batch.lower[:, :1] > 8, 3.0, -1.0))
+    before = forward_model.errors(chosen, state, batch).mean()
+    state, metrics = train(chosen, state, batch, jax.random.key(1))
+    after = forward_model.errors(chosen, state, batch)
+    assert float(jnp.median(after)) < 0.25 < float(before)
+    assert np.isfinite(metrics["loss"])
+
+
+def test_outcomes_of_weight_0_teach_nothing_and_were_not_visited(train):
+    chosen = settings()
+    state = forward_model.init(jax.random.key(0), chosen, space=SPACE)
+    half = np.arange(16) % 2
+    batch = random_outcome(16).replace(weight=np.float32(half))
+    garbage = batch.replace(end=np.where(half[:, None] > 0, batch.end, 1e6).astype(np.float32))
+    (first, _), (second, _) = (train(chosen, state, b, jax.random.key(1)) for b in (batch, garbage))
+    jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
+    starts, seen = forward_model.visited(first)
+    assert starts.shape == (32, 2)
+    np.testing.assert_array_equal(np.asarray(starts)[np.asarray(seen) > 0], batch.start[half > 0])
+
+
+def test_nothing_was_visited_before_the_first_outcome():
+    state = forward_model.init(jax.random.key(0), settings(), space=SPACE)
+    assert float(forward_model.visited(state)[1].sum()) == 0

@@ -1,0 +1,275 @@
+"""What each level learns from, against loops written from the equations, and the epoch as one pure, jitted function."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import star.state
+from star import config, hierarchy, replay
+from star.state import Spec
+
+K, L, B = 6, 3, 8  # commander.period, tutor.period and trainer.num_envs of the tiny hierarchy
+
+
+def segments(recording):
+    return [(i, b) for i in range(len(recording.subgoal)) for b in range(B)]
+
+
+def ended(recording, i, b):
+    return (recording.steps.terminated[i, :, b] * recording.steps.alive[i, :, b]).any()
+
+
+def finished(recording, i, b):
+    """Whether segment i completes k uninterrupted env steps under one target."""
+    return recording.before.clock[i, b] == K - L and not ended(recording, i, b)
+
+
+def test_only_periods_of_exactly_k_steps_teach_commander_and_forward_model(recording):
+    count = 0
+    for i, b in segments(recording):
+        expected = finished(recording, i, b)
+        assert recording.decision.weight[i, b] == recording.outcome.weight[i, b] == expected
+        count += expected
+    assert 0 < count < B * len(recording.subgoal) // 2
+
+
+def test_a_finished_period_tells_where_it_began_what_it_aimed_at_and_where_it_ended(recording):
+    began = {}
+    for i, b in segments(recording):
+        if recording.before.clock[i, b] == 0:
+            began[b] = i
+        if not finished(recording, i, b):
+            continue
+        first, decision, outcome = began[b], recording.decision, recording.outcome
+        assert first == i - 1
+        assert decision.region[i, b] == recording.commanded.region[first, b]
+        assert decision.goal_region[i, b] == recording.commanded.goal_region[first, b]
+        assert decision.target[i, b] == recording.commanded.target[first, b]
+        steps = np.concatenate([recording.steps.reward[first, :, b], recording.steps.reward[i, :, b]])
+        expected = steps.max() if recording.published else steps.mean()
+        np.testing.assert_allclose(decision.reward[i, b], expected, rtol=1e-5)
+        end = recording.steps.next_obs[i, -1, b, :2]
+        np.testing.assert_array_equal(outcome.start[i, b], recording.steps.obs[first, 0, b, :2])
+        np.testing.assert_array_equal(outcome.end[i, b], end)
+        np.testing.assert_array_equal(outcome.lower[i, b], recording.commanded.box.lower[first, b])
+        np.testing.assert_array_equal(outcome.upper[i, b], recording.commanded.box.upper[first, b])
+        region = decision.next_region[i, b]
+        assert (recording.abstraction.lower[region] <= end).all() and (end < recording.abstraction.upper[region]).all()
+
+
+def test_the_controller_is_paid_for_the_distance_to_its_moving_subgoal(recording):
+    for i, b in segments(recording):
+        for t in range(L):
+            g = recording.steps.subgoal[i, t, b]
+            s, after = recording.steps.obs[i, t, b, :2], recording.steps.next_obs[i, t, b, :2]
+            left = np.linalg.norm(s + g - after)
+            expected = -left if recording.published else np.linalg.norm(g) - left
+            np.testing.assert_allclose(recording.controller.reward[i, t, b], 0.5 * expected, atol=1e-5)
+
+
+def test_the_controller_sees_no_position_but_the_subgoal_before_and_after_the_step(recording):
+    steps, seen = recording.steps, recording.controller
+    before = np.concatenate([steps.obs[..., 2:4], steps.subgoal], axis=-1)
+    after = np.concatenate([steps.next_obs[..., 2:4], steps.next_subgoal], axis=-1)
+    np.testing.assert_array_equal(seen.obs, before)
+    np.testing.assert_array_equal(seen.next_obs, after)
+
+
+def test_the_controllers_chain_is_cut_where_the_subgoal_or_the_episode_ends(recording):
+    for i, b in segments(recording):
+        for t in range(L):
+            terminated = recording.steps.terminated[i, t, b]
+            assert recording.controller.terminated[i, t, b] == terminated
+            assert recording.controller.cut[i, t, b] == (t == L - 1 or terminated)
+            assert recording.controller.weight[i, t, b] == recording.steps.alive[i, t, b]
+
+
+def test_the_tutor_is_paid_for_the_distance_to_the_centre_of_its_box(recording):
+    for i, b in segments(recording):
+        box = recording.commanded.box
+        centre = (box.lower[i, b] + box.upper[i, b]) / 2
+        expected = 0.0
+        for t in range(L):
+            if recording.steps.alive[i, t, b]:
+                before = np.linalg.norm(recording.steps.obs[i, t, b, :2] - centre)
+                after = np.linalg.norm(recording.steps.next_obs[i, t, b, :2] - centre)
+                expected += -after if recording.published else before - after
+        np.testing.assert_allclose(recording.tutor.reward[i, b], 0.1 * expected, rtol=1e-4, atol=1e-6)
+
+
+def test_the_tutor_sees_the_state_and_the_bounds_of_its_box_but_never_the_goal(recording):
+    for i, b in segments(recording):
+        box = recording.commanded.box
+        for seen, obs in (
+            (recording.tutor.obs[i, b], recording.steps.obs[i, 0, b]),
+            (recording.tutor.next_obs[i, b], recording.steps.next_obs[i, -1, b]),
+        ):
+            origin = 0 if recording.published else obs[:2]
+            expected = np.concatenate([obs[:4], box.lower[i, b] - origin, box.upper[i, b] - origin])
+            np.testing.assert_allclose(seen, expected, atol=1e-5)
+
+
+def test_the_tutors_chain_is_cut_where_the_target_or_the_episode_ends(recording):
+    for i, b in segments(recording):
+        assert recording.tutor.terminated[i, b] == ended(recording, i, b)
+        assert recording.tutor.cut[i, b] == (recording.before.clock[i, b] == K - L or ended(recording, i, b))
+    assert (recording.tutor.weight == 1).all()
+
+
+class Epoch:
+    """The jitted epoch for one configuration and for two at once, with the number of times each was traced."""
+
+    def __init__(self, env, values):
+        self.spec = Spec.of(env.env)
+        self.config = config.parse(values)
+        self.traces = 0
+
+        def once(agent, state):
+            self.traces += 1
+            return hierarchy.epoch(agent, self.spec, env, state)
+
+        self.one = jax.jit(once)
+        self.many = jax.jit(jax.vmap(lambda agent, state: hierarchy.epoch(agent, self.spec, env, state)))
+        self.init = jax.jit(lambda key: star.state.init(self.config.agent(), self.spec, key=key))
+
+
+@pytest.fixture(scope="module")
+def epoch(breaking_env, tiny):
+    return Epoch(breaking_env, tiny)
+
+
+@pytest.fixture(scope="module")
+def first(epoch):
+    """Start and end of a first epoch."""
+    start = epoch.init(jax.random.key(0))
+    return start, *epoch.one(epoch.config.agent(), start)
+
+
+def stack(*trees):
+    return jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *trees)
+
+
+def to_numpy(tree):
+    """The tree with NumPy arrays, typed keys left out."""
+    keyless = [x for x in jax.tree.leaves(tree) if not jnp.issubdtype(x.dtype, jax.dtypes.prng_key)]
+    return [np.asarray(x) for x in keyless]
+
+
+def assert_close(actual, expected):
+    for a, b in zip(to_numpy(actual), to_numpy(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=2e-3, atol=1e-4)
+
+
+def test_an_epoch_changes_every_level_and_nothing_about_shapes_types_or_structure(first):
+    start, end, _ = first
+    kinds = [[(x.shape, x.dtype, getattr(x, "weak_type", False)) for x in jax.tree.leaves(s)] for s in (start, end)]
+    assert kinds[0] == kinds[1]
+    assert jax.tree.structure(start) == jax.tree.structure(end)
+    for name in ("commander", "tutor", "controller", "graph", "forward_model"):
+        before, after = (to_numpy(getattr(state, name)) for state in (start, end))
+        assert any((a != b).any() for a, b in zip(before, after, strict=True)), name
+    assert int(end.epoch) == 1
+
+
+def test_metrics_are_finite_scalars_prefixed_by_level(first):
+    _, _, metrics = first
+    levels = {"commander", "tutor", "controller", "forward_model", "refinement", "abstraction", "train", "env"}
+    assert {name.split("/")[0] for name in metrics} == levels
+    for name, value in metrics.items():
+        assert value.shape == () and np.isfinite(value), name
+
+
+def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(first):
+    _, end, _ = first
+    items, written = jax.tree.map(np.asarray, replay.contents(end.forward_model.ring))
+    complete = items.weight * written > 0
+    assert 0 < complete.sum() < B * 30 // K  # fewer than if no episode had ended early
+    assert np.isfinite(items.start[complete]).all() and np.isfinite(items.end[complete]).all()
+
+
+def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neither(epoch, first, tiny):
+    _, state, _ = first
+    state, _ = epoch.one(epoch.config.agent(), state)
+    other = config.parse(tiny, {"commander.discount": 0.5, "tutor.reward_scale": 0.3})
+    epoch.one(other.agent(), state)
+    assert epoch.traces == 1
+
+
+def test_seeds_and_hyperparameters_train_side_by_side_as_they_would_alone(epoch, tiny):
+    agents = [
+        epoch.config.agent(),
+        config.parse(tiny, {"controller.reward_scale": 3.0, "commander.epsilon_start": 0.0}).agent(),
+    ]
+    states = [epoch.init(jax.random.key(seed)) for seed in (0, 1)]
+    together = epoch.many(stack(*agents), stack(*states))
+    alone = [epoch.one(agent, state) for agent, state in zip(agents, states, strict=True)]
+    for i in range(2):
+        assert_close(jax.tree.map(lambda x, i=i: x[i], together), alone[i])
+    # The same seed under the other hyperparameters, to see that they matter.
+    swapped = epoch.one(agents[1], states[0])
+    assert float(swapped[1]["controller/reward"]) != float(alone[0][1]["controller/reward"])
+
+
+def test_a_split_reaches_every_table_indexed_by_regions(epoch):
+    state = epoch.init(jax.random.key(0))
+    capacity = state.abstraction.capacity
+    count = int(state.abstraction.count)
+    q = jnp.arange(float(capacity**3)).reshape(3 * (capacity,))
+    # A model that predicts a step of +0.1 along x, and one due pair that it splits: region 0 and the next along x.
+    params = jax.tree.map(jnp.zeros_like, state.forward_model.params)
+    half = (state.abstraction.space[1] - state.abstraction.space[0]) / 2
+    last = params["params"]["Dense_1"]
+    params = {"params": {**params["params"], "Dense_1": {**last, "bias": jnp.array([1.9, 0.0]) / half}}}
+    rng = np.random.default_rng(0)
+    starts = jnp.asarray(rng.uniform(-4, -0.2, (64, 2)), jnp.float32)
+    example, _ = replay.contents(state.forward_model.ring)
+    ring = replay.add(state.forward_model.ring, example.replace(start=starts, weight=jnp.ones(64)))
+    target = 4  # the grid of 4 x 4 is stored row by row, so this is the box beside region 0 along x
+    state = state.replace(
+        commander=state.commander.replace(q=q, chosen=jnp.ones(capacity)),
+        forward_model=state.forward_model.replace(params=params, ring=ring),
+        abstraction=state.abstraction.replace(upper=state.abstraction.upper.at[target, 0].set(2.0)),
+        graph=state.graph.replace(
+            transitions=state.graph.transitions.at[0, target].set(9.0),
+            stable=state.graph.stable.at[0, target].set(True),
+        ),
+    )
+    after, metrics = jax.jit(hierarchy.refine)(epoch.config.agent(), state)
+    assert int(metrics["splits"]) == 1
+    assert int(after.abstraction.count) == count + 1
+    expected = np.array(q)
+    expected[count] = expected[0]
+    expected[:, count] = expected[:, 0]
+    expected[:, :, count] = expected[:, :, 0]
+    np.testing.assert_array_equal(after.commander.q, expected)
+    assert float(after.commander.chosen[0]) == float(after.commander.chosen[count]) == 0.5
+
+
+@pytest.mark.parametrize("section", ["forward_model", "tutor.td3", "controller.td3"])
+def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tiny, section):
+    overrides = {f"{section}.batch_size": 65, f"{section}.buffer_size": 64}
+    if "." in section:
+        overrides[f"{section.split('.')[0]}.learner"] = "td3"
+    with pytest.raises(ValueError) as caught:
+        star.state.check(config.parse(tiny, overrides), Spec.of(breaking_env.env))
+    assert f"{section}.batch_size" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_published_learners_run_a_whole_epoch(breaking_env, tiny):
+    td3 = {"hidden": [8], "batch_size": 8, "buffer_size": 64, "min_transitions": 8, "updates_per_rollout": 2}
+    values = {
+        **tiny,
+        "commander": {"period": K, "sweeps": 0, "reward": "max", "successors": "known"},
+        "tutor": {"period": L, "unroll": 2, "learner": "td3", "off_policy_correction": True, "td3": td3},
+        "controller": {"learner": "td3", "td3": td3},
+    }
+    published = Epoch(breaking_env, values)
+    start = published.init(jax.random.key(0))
+    end, metrics = published.one(published.config.agent(), start)
+    assert int(end.tutor.updates) == 10 and int(end.controller.updates) == 20
+    assert (np.asarray(end.commander.q) != 0).any()
+    for name, value in metrics.items():
+        assert np.isfinite(value), name
+    for leaf in jax.tree.leaves((end.tutor.params, end.controller.params, end.commander)):
+        assert np.isfinite(leaf).all()

@@ -1,0 +1,142 @@
+"""PPO: advantages against a slow loop, and learning on the smallest of tasks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from star import config, ppo
+from star.replay import Transition
+
+T, B = 6, 8
+
+
+def settings(**values):
+    values = {"hidden": [16], "passes": 2, "minibatches": 2} | values
+    return config.parse({"controller": {"ppo": values}, "trainer": {"num_envs": 64}}).controller.ppo
+
+
+def random_rollout(seed=0):
+    rng = np.random.default_rng(seed)
+    f32 = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    terminated = (rng.random((T, B)) < 0.2).astype(np.float32)
+    return Transition(
+        obs=f32(T, B, 3),
+        action=f32(T, B, 2),
+        reward=f32(T, B),
+        next_obs=f32(T, B, 3),
+        terminated=terminated,
+        cut=np.maximum(terminated, rng.random((T, B)) < 0.2).astype(np.float32),
+        weight=np.ones((T, B), np.float32),
+    )
+
+
+EXAMPLE = jax.tree.map(lambda x: jnp.asarray(x[0, 0]), random_rollout())
+
+
+@pytest.fixture(scope="module")
+def start():
+    return jax.jit(lambda key: ppo.init(key, settings(), example=EXAMPLE))(jax.random.key(0))
+
+
+@pytest.fixture(scope="module")
+def update():
+    return jax.jit(lambda chosen, state, rollout, key: ppo.update(chosen, state, rollout, key=key))
+
+
+def test_advantages_stop_at_cuts_and_bootstrap_unless_terminated():
+    rollout = random_rollout()
+    values, next_values = np.random.default_rng(1).normal(size=(2, T, B)).astype(np.float32)
+    got = ppo.advantages(settings(discount=0.9, gae_lambda=0.8), rollout, values, next_values)
+    for b in range(B):
+        for t in range(T):
+            expected, factor = 0.0, 1.0
+            for u in range(t, T):
+                future = 0.0 if rollout.terminated[u, b] else 0.9 * next_values[u, b]
+                expected += factor * (rollout.reward[u, b] + future - values[u, b])
+                factor *= 0.9 * 0.8
+                if rollout.cut[u, b] or rollout.terminated[u, b]:
+                    break
+            np.testing.assert_allclose(got[t, b], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_first_gradient_step_starts_from_the_policy_that_collected(start, update):
+    once = settings(passes=1, minibatches=1)
+    rollout = random_rollout()
+    # Statistics of its own show that collecting and learning normalise alike.
+    state, _ = update(once, start, rollout, jax.random.key(1))
+    actions = jax.jit(lambda s, obs, key: ppo.act(once, s, obs, key=key))(state, rollout.obs, jax.random.key(2))
+    _, metrics = update(once, state, rollout.replace(action=actions), jax.random.key(3))
+    np.testing.assert_allclose(metrics["kl"], 0, atol=1e-5)
+    assert float(metrics["clipped"]) == 0
+    np.testing.assert_allclose(metrics["actor_loss"], 0, atol=1e-5)  # ratio 1, advantages of mean 0
+
+
+def test_exploration_is_gaussian_about_the_deterministic_action(start):
+    chosen = settings(initial_std=0.5)
+    state = ppo.init(jax.random.key(0), chosen, example=EXAMPLE)
+    obs = jnp.broadcast_to(jnp.array([1.0, -2.0, 0.5]), (4000, 3))
+    mean = ppo.act(chosen, state, obs[0], deterministic=True, key=jax.random.key(1))
+    drawn = ppo.act(chosen, state, obs, key=jax.random.key(1))
+    np.testing.assert_allclose(drawn.mean(0), mean, atol=0.05)
+    np.testing.assert_allclose(drawn.std(0), 0.5, atol=0.03)
+
+
+def test_samples_of_weight_0_have_no_influence(start, update):
+    rollout = random_rollout()
+    over = np.arange(T)[:, None] >= np.array([2, 3, 4, 5, 6, 6, 6, 6])  # steps after an environment ended
+    terminated = np.zeros((T, B), np.float32)
+    terminated[[1, 2, 3, 4], [0, 1, 2, 3]] = 1
+    rollout = rollout.replace(weight=np.float32(~over), terminated=terminated, cut=terminated)
+    rng = np.random.default_rng(5)
+
+    def spoil(x):
+        where = over.reshape(T, B, *(1,) * (x.ndim - 2))
+        return np.where(where, 5 * rng.normal(size=x.shape), x).astype(np.float32)
+
+    spoilt = rollout.replace(
+        **{name: spoil(getattr(rollout, name)) for name in ("obs", "action", "reward", "next_obs")}
+    )
+    (first, _), (second, _) = (update(settings(), start, r, jax.random.key(1)) for r in (rollout, spoilt))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), first, second)
+    assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (first.params, start.params)), strict=True))
+
+
+def test_the_step_size_shrinks_after_large_changes_of_the_policy_and_grows_after_small_ones(start, update):
+    rollout = random_rollout()
+    for target, factor in ((1e-12, 1 / 1.5), (1e3, 1.5)):
+        chosen = settings(passes=1, target_kl=target, minibatches=2, learning_rate=5e-4, max_learning_rate=1.0)
+        state, metrics = update(chosen, start, rollout, jax.random.key(1))
+        np.testing.assert_allclose(state.learning_rate, 5e-4 * factor, rtol=1e-4)
+        np.testing.assert_allclose(metrics["learning_rate"], state.learning_rate)
+
+
+def test_it_learns_a_bandit_with_two_contexts():
+    chosen = settings(learning_rate=3e-3, max_learning_rate=1e-2, passes=4, target_kl=0.05)
+    example = EXAMPLE.replace(obs=jnp.zeros(1), next_obs=jnp.zeros(1), action=jnp.zeros(1))
+    contexts = jnp.where(jnp.arange(64) % 2, 1.0, -1.0)[None, :, None]
+
+    def once(state, key):
+        act_key, update_key = jax.random.split(key)
+        action = ppo.act(chosen, state, contexts, key=act_key)
+        one = jnp.ones((1, 64))
+        rollout = Transition(
+            obs=contexts,
+            action=action,
+            reward=-jnp.square(action - 0.5 * contexts)[..., 0],
+            next_obs=contexts,
+            terminated=one,
+            cut=one,
+            weight=one,
+        )
+        return ppo.update(chosen, state, rollout, key=update_key)
+
+    @jax.jit
+    def learn(key):
+        state = ppo.init(key, chosen, example=example)
+        state, metrics = jax.lax.scan(once, state, jax.random.split(key, 80))
+        return ppo.act(chosen, state, jnp.array([[1.0], [-1.0]]), deterministic=True, key=key), metrics
+
+    action, metrics = learn(jax.random.key(0))
+    np.testing.assert_allclose(action[:, 0], [0.5, -0.5], atol=0.15)
+    assert metrics["std"][-1] < metrics["std"][0]

@@ -1,0 +1,290 @@
+"""When a pair is examined, where a region is cut, and what is remembered of it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from star import abstraction as regions
+from star import config, forward_model, refinement, replay
+from star.reachability import MISSES, REACHES, UNKNOWN, Leaves
+from star.refinement import Graph, Split
+
+R = 6
+SPACE = ((-4.0, -4.0), (20.0, 20.0))
+
+
+def settings(**values):
+    refine = {"min_transitions": 10, "min_visits": 5, "depth": 3, "pairs_per_epoch": 1, "miss_lifetime": 2}
+    # `min_width` and the like are traced, so overrides of floats compile nothing.
+    model = {"hidden": [4], "buffer_size": 2000}
+    values = {f"refinement.{key}": value for key, value in refine.items()} | values
+    return config.parse({"forward_model": model, "abstraction": {"max_regions": R}}, values).agent()
+
+
+CONFIG = settings()
+
+
+def grid(cuts=((8.0,), (8.0,))):
+    return regions.create(SPACE, cuts, max_regions=R)
+
+
+def random_graph(seed):
+    rng = np.random.default_rng(seed)
+    return Graph(
+        verdict=jnp.asarray(rng.integers(0, 3, (R, R)), jnp.int32),
+        age=jnp.asarray(rng.integers(0, 4, (R, R)), jnp.int32),
+        transitions=jnp.asarray(rng.integers(0, 21, (R, R)), jnp.float32),
+        error=jnp.asarray(rng.random((R, R)), jnp.float32),
+        stable=jnp.asarray(rng.random((R, R)) < 0.5),
+    )
+
+
+def knowing(*pairs, transitions=100.0):
+    """A graph in which `pairs` have passed the gate."""
+    graph = refinement.init(capacity=R)
+    for pair in pairs:
+        graph = graph.replace(
+            transitions=graph.transitions.at[pair].set(transitions), stable=graph.stable.at[pair].set(True)
+        )
+    return graph
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """A forward model that is known exactly: whatever is commanded, `by` is added; visits lie everywhere."""
+    state = forward_model.init(jax.random.key(0), CONFIG.forward_model, space=jnp.array(SPACE))
+    example, _ = replay.contents(state.ring)
+    starts = jax.random.uniform(jax.random.key(1), (2000, 2), minval=-4.0, maxval=20.0)
+    ring = replay.add(state.ring, example.replace(start=starts, weight=jnp.ones(2000)))
+
+    def make(by):
+        params = jax.tree.map(jnp.zeros_like, state.params)
+        params["params"]["Dense_1"]["bias"] = jnp.array(by, jnp.float32) / 12
+        return state.replace(params=params, ring=ring)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def refine():
+    return jax.jit(refinement.refine)
+
+
+def test_observe_counts_and_compares_errors_pair_by_pair():
+    graph = random_graph(0)
+    rng = np.random.default_rng(1)
+    n = 50
+    region, target = rng.integers(0, 4, (2, n))
+    error, weight = rng.random(n).astype(np.float32), (rng.random(n) < 0.6).astype(np.float32)
+    chosen = settings(**{"refinement.error_tolerance": 0.2})
+    observe = jax.jit(lambda c, g, r, t, e, w: refinement.observe(c, g, region=r, target=t, error=e, weight=w))
+    after = observe(chosen, graph, region, target, error, weight)
+    for i in range(R):
+        for j in range(R):
+            mine = [error[k] for k in range(n) if weight[k] and (region[k], target[k]) == (i, j)]
+            assert float(after.transitions[i, j]) == float(graph.transitions[i, j]) + len(mine)
+            if mine:
+                np.testing.assert_allclose(after.error[i, j], np.mean(mine), rtol=1e-5)
+                assert bool(after.stable[i, j]) == (not np.mean(mine) < 0.8 * float(graph.error[i, j]))
+            else:
+                assert float(after.error[i, j]) == float(graph.error[i, j])
+                assert bool(after.stable[i, j]) == bool(graph.stable[i, j])
+
+
+def test_an_error_measured_for_the_first_time_is_not_yet_stable():
+    once = lambda graph: refinement.observe(  # noqa: E731
+        CONFIG,
+        graph,
+        region=jnp.array([0]),
+        target=jnp.array([1]),
+        error=jnp.array([3.0]),
+        weight=jnp.array([1.0]),
+    )
+    graph = once(refinement.init(capacity=R))
+    assert not bool(graph.stable[0, 1])
+    assert bool(once(graph).stable[0, 1])
+
+
+GATE = {
+    "all conditions met": ({}, True),
+    "too few transitions": ({"transitions": 9.0}, False),
+    "an error that still falls": ({"stable": False}, False),
+    "known to reach": ({"verdict": REACHES}, False),
+    "known to miss": ({"verdict": MISSES}, False),
+}
+
+
+@pytest.mark.parametrize("name", GATE)
+def test_the_gate(name):
+    changes, passes = GATE[name]
+    graph = knowing((0, 1), transitions=10.0)
+    for field, value in changes.items():
+        graph = graph.replace(**{field: getattr(graph, field).at[0, 1].set(value)})
+    waiting = refinement.due(CONFIG, graph, jnp.arange(R) < 4)
+    assert bool(waiting[0, 1]) == passes
+    assert int(waiting.sum()) == passes
+
+
+def test_the_gate_keeps_out_a_region_as_its_own_target_and_inactive_regions():
+    graph = knowing((1, 1), (0, 4), (4, 0), (2, 3))
+    waiting = np.asarray(refinement.due(CONFIG, graph, jnp.arange(R) < 4))
+    assert np.argwhere(waiting).tolist() == [[2, 3]]
+
+
+def test_misses_are_forgotten_after_their_lifetime_and_edges_are_not():
+    graph = knowing((0, 1), (0, 2))
+    verdict = graph.verdict.at[0, 1].set(MISSES).at[0, 2].set(REACHES)
+    graph = graph.replace(verdict=verdict)
+    seen = []
+    for _ in range(4):
+        graph = refinement.forget(CONFIG, graph)
+        seen.append((int(graph.verdict[0, 1]), int(graph.verdict[0, 2]), float(graph.transitions[0, 1])))
+    assert seen == [(MISSES, REACHES, 100.0)] * 2 + [(UNKNOWN, REACHES, 0.0)] * 2
+
+
+def slow_gain(lower, upper, leaves, dimension, position):
+    """Decrease of Gini impurity by one cut of the box, as a share of the volume of all leaves."""
+
+    def impurity(low, high):
+        whole = reaching = 0.0
+        for a, b, reaches in zip(*leaves, strict=True):
+            volume = np.prod(np.maximum(np.minimum(b, high) - np.maximum(a, low), 0))
+            whole, reaching = whole + volume, reaching + volume * reaches
+        return reaching * (whole - reaching) / whole if whole else 0.0
+
+    below, above = upper.copy(), lower.copy()
+    below[dimension] = above[dimension] = position
+    total = sum(np.prod(b - a) for a, b, _ in zip(*leaves, strict=True))
+    return (impurity(lower, upper) - impurity(lower, below) - impurity(above, upper)) / total
+
+
+@pytest.fixture(scope="module")
+def best_cut():
+    return jax.jit(lambda a, c, leaves, width: refinement.best_cut(a, c, leaves, min_width=width))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_best_cut_is_that_of_a_brute_force_gini_search(best_cut, seed):
+    rng = np.random.default_rng(seed)
+    # The leaves tile [-4, 8] x [-4, 20], which is regions 0 and 1; only one of them may be cut in odd cases.
+    edges = np.array([[x, y] for x in range(4) for y in range(8)], float)
+    lower, upper = -4 + 3 * edges, -1 + 3 * edges
+    score = edges @ rng.normal(size=2) + 0.3 * rng.normal(size=32)
+    reaches = score > np.median(score)
+    leaves = lower, upper, reaches
+    abstraction, candidates = grid(), [0] if seed % 2 else [0, 1]
+    best = 0.0
+    for region in candidates:
+        low, high = np.float64(abstraction.lower[region]), np.float64(abstraction.upper[region])
+        for dimension in (0, 1):
+            for position in np.unique(upper[:, dimension]):
+                if low[dimension] + 2 <= position <= high[dimension] - 2:
+                    best = max(best, slow_gain(low, high, leaves, dimension, position))
+    given = Leaves(jnp.float32(lower), jnp.float32(upper), jnp.asarray(reaches))
+    cut, gain = best_cut(abstraction, jnp.isin(jnp.arange(R), jnp.array(candidates)), given, 2.0)
+    np.testing.assert_allclose(gain, best, rtol=1e-4, atol=1e-6)
+    assert best > 0 and int(cut.region) in candidates
+    low, high = np.float64(abstraction.lower[cut.region]), np.float64(abstraction.upper[cut.region])
+    got = slow_gain(low, high, leaves, int(cut.dimension), float(cut.position))
+    np.testing.assert_allclose(got, best, rtol=1e-4)
+    assert low[cut.dimension] + 2 <= cut.position <= high[cut.dimension] - 2
+
+
+def test_after_a_split_starts_inherit_verdicts_and_targets_begin_anew():
+    graph = random_graph(2)
+    after = refinement.on_split(graph, Split(done=jnp.array(True), parent=jnp.int32(1), child=jnp.int32(4)))
+    for i in range(R):
+        for j in range(R):
+            changed = i in (1, 4) or j in (1, 4)
+            old = graph.verdict[1 if i == 4 else i, j]
+            assert int(after.verdict[i, j]) == (UNKNOWN if j in (1, 4) else int(old))
+            assert float(after.transitions[i, j]) == (0 if changed else float(graph.transitions[i, j]))
+            assert float(after.error[i, j]) == (np.inf if changed else float(graph.error[i, j]))
+            assert bool(after.stable[i, j]) == (not changed and bool(graph.stable[i, j]))
+    unchanged = refinement.on_split(graph, Split(done=jnp.array(False), parent=jnp.int32(1), child=jnp.int32(4)))
+    jax.tree.map(np.testing.assert_array_equal, graph, unchanged)
+
+
+def test_a_region_of_which_a_part_reaches_is_cut_where_that_part_begins(refine, moving):
+    # +6 along x carries [2, 8] of region 0 = [-4, 8]^2 into region 2 = [8, 20] x [-4, 8], and [-4, 2] does not.
+    abstraction, graph, splits, metrics = refine(CONFIG, grid(), knowing((0, 2)), moving((6, 0)))
+    assert (int(metrics["examined"]), int(metrics["mixed"]), int(metrics["splits"])) == (1, 1, 1)
+    assert int(abstraction.count) == 5
+    np.testing.assert_allclose(abstraction.upper[0], [2, 8], atol=1e-5)
+    np.testing.assert_allclose(abstraction.lower[4], [2, -4], atol=1e-5)
+    np.testing.assert_allclose(abstraction.upper[4], [8, 8], atol=1e-5)
+    assert splits.done.tolist() == [True]
+    assert (int(splits.parent[0]), int(splits.child[0])) == (0, 4)
+    assert not (graph.verdict != UNKNOWN).any()
+    assert float(graph.transitions[0, 2]) == 0
+
+
+def test_the_parts_get_verdicts_and_a_miss_is_examined_again_after_its_lifetime(refine, moving):
+    model = moving((6, 0))
+    abstraction, *_ = refine(CONFIG, grid(), knowing((0, 2)), model)
+    graph = knowing((0, 2), (4, 2))
+    found = []
+    for _ in range(5):
+        abstraction, graph, _, metrics = refine(CONFIG, abstraction, graph, model)
+        found.append((int(graph.verdict[4, 2]), int(graph.verdict[0, 2]), int(metrics["examined"])))
+    assert int(abstraction.count) == 5
+    # One pair an epoch, the first of equals; the miss of epoch 1 lives two more, then needs new transitions.
+    assert found == [
+        (UNKNOWN, MISSES, 1),
+        (REACHES, MISSES, 1),
+        (REACHES, MISSES, 0),
+        (REACHES, UNKNOWN, 0),
+        (REACHES, UNKNOWN, 0),
+    ]
+
+
+def test_the_pair_commanded_most_is_examined_first(refine, moving):
+    graph = knowing((0, 2), (1, 3))
+    graph = graph.replace(transitions=graph.transitions.at[1, 3].set(500.0))
+    _, graph, _, metrics = refine(CONFIG, grid(), graph, moving((12, 0)))
+    assert int(graph.verdict[1, 3]) == REACHES
+    assert int(graph.verdict[0, 2]) == UNKNOWN
+    assert int(metrics["edges"]) == 1
+
+
+def test_a_region_nobody_started_in_does_not_reach(refine, moving):
+    model = moving((12, 0))
+    items, _ = replay.contents(model.ring)
+    elsewhere = items.replace(start=jnp.full_like(items.start, 15.0))
+    _, graph, _, _ = refine(CONFIG, grid(), knowing((0, 2)), model.replace(ring=replay.add(model.ring, elsewhere)))
+    assert int(graph.verdict[0, 2]) == MISSES
+
+
+def test_nothing_is_examined_before_a_pair_is_due(refine, moving):
+    before = grid()
+    abstraction, graph, splits, metrics = refine(CONFIG, before, knowing(), moving((6, 0)))
+    jax.tree.map(np.testing.assert_array_equal, before, abstraction)
+    assert int(metrics["examined"]) == 0 and not splits.done.any()
+    assert not (graph.verdict != UNKNOWN).any()
+
+
+def test_a_full_table_is_reported_and_stays_as_it_is(refine, moving):
+    full = grid(cuts=((8.0,), (0.0, 8.0)))
+    assert int(full.count) == R
+    abstraction, _, splits, metrics = refine(CONFIG, full, knowing((0, 3)), moving((6, 0)))
+    assert int(metrics["table_full"]) == 1 and int(metrics["mixed"]) == 1 and int(metrics["splits"]) == 0
+    assert not splits.done.any()
+    jax.tree.map(np.testing.assert_array_equal, full, abstraction)
+
+
+def test_no_region_is_cut_narrower_than_min_width(refine, moving):
+    for width, count in ((6.5, 4), (5.5, 5)):
+        chosen = settings(**{"abstraction.min_width": width})
+        abstraction, _, _, metrics = refine(chosen, grid(), knowing((0, 2)), moving((6, 0)))
+        assert int(metrics["mixed"]) == 1
+        assert int(abstraction.count) == count
+
+
+def test_an_examined_pair_may_make_several_cuts(moving):
+    # +6 along both axes: only the upper right quarter of region 0 reaches region 3, which takes two cuts to part.
+    chosen = settings(**{"refinement.cuts_per_pair": 2})
+    abstraction, _, splits, _ = jax.jit(refinement.refine)(chosen, grid(), knowing((0, 3)), moving((6, 6)))
+    assert splits.done.tolist() == [True, True]
+    corners = np.concatenate([abstraction.lower, abstraction.upper], axis=1)
+    assert [2, 2, 8, 8] in corners.tolist()

@@ -1,0 +1,164 @@
+"""TD3: when it updates, what its critics aim at, and learning on the smallest of tasks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from star import config, replay, td3
+from star.replay import Transition
+
+
+def settings(**values):
+    values = {
+        "hidden": [8],
+        "batch_size": 16,
+        "buffer_size": 64,
+        "min_transitions": 8,
+        "updates_per_rollout": 1,
+        "tau": 0.1,
+    } | values
+    return config.parse({"controller": {"learner": "td3", "td3": values}}).controller.td3
+
+
+EXAMPLE = Transition(
+    obs=jnp.zeros(3),
+    action=jnp.zeros(2),
+    reward=jnp.zeros(()),
+    next_obs=jnp.zeros(3),
+    terminated=jnp.zeros(()),
+    cut=jnp.zeros(()),
+    weight=jnp.zeros(()),
+)
+
+
+def random_rollout(n, seed=0):
+    """[1, n] transitions."""
+    rng = np.random.default_rng(seed)
+    f32 = lambda *shape: rng.uniform(-1, 1, shape).astype(np.float32)  # noqa: E731
+    zero, one = np.zeros((1, n), np.float32), np.ones((1, n), np.float32)
+    return Transition(f32(1, n, 3), f32(1, n, 2), f32(1, n), f32(1, n, 3), zero, zero, one)
+
+
+@pytest.fixture(scope="module")
+def start():
+    state = jax.jit(lambda key: td3.init(key, settings(), example=EXAMPLE))(jax.random.key(0))
+    # Targets unlike the networks show that they are used, and how they move.
+    return state.replace(target=jax.tree.map(lambda p: 0.5 * p + 0.1, state.target))
+
+
+@pytest.fixture(scope="module")
+def update():
+    return jax.jit(lambda chosen, state, rollout, key: td3.update(chosen, state, rollout, key=key))
+
+
+def slow_mlp(params, x):
+    layers = params["params"]
+    for i in range(len(layers)):
+        x = x @ np.float64(layers[f"Dense_{i}"]["kernel"]) + np.float64(layers[f"Dense_{i}"]["bias"])
+        x = np.maximum(x, 0) if i < len(layers) - 1 else x
+    return x
+
+
+def slow_qs(critics, obs, action):
+    x = np.concatenate([obs, action])
+    return [slow_mlp(jax.tree.map(lambda p, i=i: p[i], critics), x)[0] for i in range(2)]
+
+
+@pytest.mark.parametrize("terminated", [0.0, 1.0])
+def test_the_critics_aim_at_the_smaller_target_and_do_not_bootstrap_past_a_termination(start, update, terminated):
+    chosen = settings(target_noise=0.0, discount=0.9)
+    one = random_rollout(1)
+    rollout = jax.tree.map(lambda x: np.repeat(x, 16, axis=1), one)  # any batch is made of this one
+    rollout = rollout.replace(terminated=np.full((1, 16), terminated, np.float32))
+    obs, action, reward, next_obs = (np.float64(x[0, 0]) for x in (one.obs, one.action, one.reward, one.next_obs))
+    next_action = np.tanh(slow_mlp(start.target["actor"], next_obs))
+    goal = reward + 0.9 * (1 - terminated) * min(slow_qs(start.target["critic"], next_obs, next_action))
+    expected = sum((q - goal) ** 2 for q in slow_qs(start.params["critic"], obs, action))
+    _, metrics = update(chosen, start, rollout, jax.random.key(1))
+    np.testing.assert_allclose(metrics["critic_loss"], expected, rtol=1e-4)
+
+
+def test_there_is_no_update_before_enough_transitions(start, update):
+    state, _ = update(settings(), start, random_rollout(7), jax.random.key(1))
+    assert int(state.updates) == 0 and int(replay.filled(state.ring)) == 7
+    jax.tree.map(np.testing.assert_array_equal, state.replace(ring=None), start.replace(ring=None))
+    state, _ = update(settings(), state, random_rollout(1), jax.random.key(1))
+    assert int(state.updates) == 1
+
+
+def test_actor_and_targets_move_every_second_update_and_targets_by_tau(start, update):
+    changed = lambda a, b: any((x != y).any() for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True))  # noqa: E731
+    before = start
+    for step in range(4):
+        after, _ = update(settings(), before, random_rollout(8, seed=step), jax.random.key(step))
+        assert int(after.updates) == step + 1
+        assert changed(after.params["critic"], before.params["critic"])
+        moves = step % 2 == 0
+        assert changed(after.params["actor"], before.params["actor"]) == moves
+        rate = 0.1 if moves else 0.0
+        jax.tree.map(
+            lambda t, old, p, rate=rate: np.testing.assert_allclose(t, old + rate * (p - old), rtol=1e-4, atol=1e-6),
+            after.target,
+            before.target,
+            after.params,
+        )
+        before = after
+
+
+def test_transitions_of_weight_0_have_no_influence(start, update):
+    rollout = random_rollout(16)
+    off = np.arange(16) % 2 == 1
+    rollout = rollout.replace(weight=np.float32(~off)[None])
+    spoilt = rollout.replace(reward=np.where(off, 1e3, rollout.reward).astype(np.float32))
+    (first, _), (second, _) = (update(settings(), start, r, jax.random.key(1)) for r in (rollout, spoilt))
+    jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
+
+
+def test_relabelling_applies_to_the_batches_but_not_to_the_buffer(start):
+    def relabel(batch, key):
+        return batch.replace(reward=batch.reward + 100.0)
+
+    run = jax.jit(lambda r, key: td3.update(settings(), start, r, relabel=relabel, key=key))
+    state, metrics = run(random_rollout(16), jax.random.key(1))
+    assert float(metrics["critic_loss"]) > 1000
+    assert float(jnp.abs(replay.contents(state.ring)[0].reward).max()) <= 1
+
+
+def test_actions_stay_in_range_and_noise_is_for_exploration_only(start):
+    chosen = settings(exploration_noise=0.5)
+    obs = jnp.broadcast_to(jnp.array([1.0, -2.0, 0.5]), (3000, 3))
+    keys = jax.random.split(jax.random.key(0))
+    still = [td3.act(chosen, start, obs[0], deterministic=True, key=key) for key in keys]
+    np.testing.assert_array_equal(*still)
+    noisy = td3.act(chosen, start, obs, key=keys[0])
+    assert float(jnp.abs(noisy).max()) <= 1
+    np.testing.assert_allclose(jnp.clip(noisy, -0.9, 0.9).mean(0), still[0], atol=0.05)
+    assert (noisy.std(0) > 0.3).all()
+
+
+def test_it_learns_the_best_action_of_a_one_step_task():
+    chosen = settings(
+        hidden=[32],
+        batch_size=64,
+        buffer_size=512,
+        updates_per_rollout=20,
+        actor_learning_rate=3e-3,
+        critic_learning_rate=3e-3,
+    )
+    example = EXAMPLE.replace(obs=jnp.zeros(1), next_obs=jnp.zeros(1), action=jnp.zeros(1))
+
+    def once(state, key):
+        action_key, obs_key, update_key = jax.random.split(key, 3)
+        obs = jnp.where(jax.random.bernoulli(obs_key, shape=(1, 32, 1)), 1.0, -1.0)
+        action = jax.random.uniform(action_key, (1, 32, 1), minval=-1, maxval=1)
+        one = jnp.ones((1, 32))
+        reward = -jnp.square(action - 0.5 * obs)[..., 0]
+        return td3.update(chosen, state, Transition(obs, action, reward, obs, one, one, one), key=update_key)
+
+    @jax.jit
+    def learn(key):
+        state, _ = jax.lax.scan(once, td3.init(key, chosen, example=example), jax.random.split(key, 40))
+        return td3.act(chosen, state, jnp.array([[1.0], [-1.0]]), deterministic=True, key=key)
+
+    np.testing.assert_allclose(learn(jax.random.key(0))[:, 0], [0.5, -0.5], atol=0.15)

@@ -1,0 +1,269 @@
+"""Whole runs through the trainer, on a maze small enough to train in a second."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import yaml
+
+from star import cli, trainer
+from star.checkpoint import Checkpoints
+from star.config import ConfigError, load, parse
+from star.metrics import JsonLines
+
+ROOT = Path(__file__).parents[1]
+TIMES = ("wall_s", "env_steps_per_s")
+EPOCH = 4 * 60  # env steps
+
+TINY = {
+    "env": {"name": "point_maze", "options": {"episode_length": 60}},
+    "commander": {"period": 20},
+    "tutor": {"unroll": 3, "ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
+    "controller": {"ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
+    "abstraction": {"max_regions": 8},
+    "forward_model": {"hidden": [8], "buffer_size": 64, "batch_size": 8, "updates_per_epoch": 2},
+    "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
+    "trainer": {
+        "num_envs": 4,
+        "total_env_steps": 4 * EPOCH,
+        "eval_every": 2,
+        "eval_episodes": 3,
+        "checkpoint_every": 2,
+        "num_seeds": 2,
+    },
+}
+
+
+def tiny(**overrides):
+    return parse(TINY, {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+def rows(run_dir):
+    return [{k: v for k, v in row.items() if k not in TIMES} for row in JsonLines(run_dir / "metrics.jsonl").read()]
+
+
+def saved_state(config, run_dir):
+    program = trainer.build(config)
+    checkpoints = Checkpoints(run_dir)
+    state = checkpoints.restore(checkpoints.steps()[-1], jax.eval_shape(program.init, trainer.seed_keys(program)))
+    checkpoints.close()
+    return jax.tree.map(
+        lambda x: np.asarray(jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x),
+        state,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run of four epochs and two seeds that was never interrupted."""
+    run_dir = tmp_path_factory.mktemp("runs") / "finished"
+    result = trainer.train(tiny(), run_dir, quiet=True)
+    return run_dir, result
+
+
+def test_a_run_leaves_config_metrics_checkpoints_and_figure(finished):
+    run_dir, result = finished
+    assert result.env_steps == 4 * EPOCH and not result.interrupted
+    assert {entry.name for entry in run_dir.iterdir()} == {"config.yaml", "metrics.jsonl", "checkpoints", "figures"}
+    assert (run_dir / "figures" / "summary.png").read_bytes().startswith(b"\x89PNG")
+    assert Checkpoints(run_dir).steps() == [2 * EPOCH, 4 * EPOCH]
+
+
+def test_config_yaml_holds_every_resolved_value_and_can_be_trained_again(finished):
+    run_dir, _ = finished
+    config = load(run_dir / "config.yaml")
+    assert config.env.engine == "jax"
+    assert config.abstraction.cuts == ((8.0,), (8.0,))
+    assert yaml.safe_load((run_dir / "config.yaml").read_text()) == config.model_dump(mode="json")
+
+
+def test_metrics_have_a_line_for_each_epoch_and_seed(finished):
+    run_dir, _ = finished
+    table = rows(run_dir)
+    assert [(row["env_steps"], row["seed"]) for row in table] == [(n * EPOCH, s) for n in (1, 2, 3, 4) for s in (0, 1)]
+    assert all("train/success_any" in row and "abstraction/regions" in row for row in table)
+    assert [row["env_steps"] // EPOCH for row in table if "eval/success_final" in row] == [2, 2, 4, 4]
+
+
+def test_seeds_differ(finished):
+    run_dir, _ = finished
+    first, second = rows(run_dir)[-2:]
+    assert first["train/return"] != second["train/return"]
+
+
+def test_two_runs_of_one_config_and_seed_write_the_same_metrics(finished, tmp_path):
+    run_dir, _ = finished
+    trainer.train(tiny(), tmp_path / "again", quiet=True)
+    assert rows(tmp_path / "again") == rows(run_dir)
+
+
+def test_an_interrupted_run_resumes_to_the_same_final_state_bit_for_bit(finished, tmp_path, monkeypatch):
+    run_dir, _ = finished
+    part = tmp_path / "part"
+    interrupt_after(monkeypatch, epochs=3)
+    stopped = trainer.train(tiny(), part, quiet=True)
+    assert stopped.interrupted and stopped.env_steps == 3 * EPOCH
+    monkeypatch.undo()
+    result = trainer.train(load(part / "config.yaml"), part, resume=True, quiet=True)
+    assert not result.interrupted
+    assert rows(part) == rows(run_dir)
+    assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+
+
+def test_metrics_written_after_the_checkpoint_are_dropped_on_resume(finished, tmp_path):
+    run_dir, _ = finished
+    sink = JsonLines(tmp_path / "metrics.jsonl")
+    for row in rows(run_dir):
+        sink.write(row)
+    with sink.path.open("a") as file:
+        file.write('{"env_steps": 1, "half a li')
+    assert [row["env_steps"] for row in sink.keep_until(2 * EPOCH)] == [EPOCH, EPOCH, 2 * EPOCH, 2 * EPOCH]
+    assert len(sink.path.read_text().splitlines()) == 4
+
+
+def test_nothing_is_compiled_after_the_first_epoch(caplog):
+    program = trainer.build(tiny())
+    state, _ = program.epoch(program.init(trainer.seed_keys(program)))
+    with jax.log_compiles(True), caplog.at_level("WARNING"):
+        state, _ = program.epoch(state)
+        program.epoch(state)
+    assert not [record.getMessage() for record in caplog.records if "ompil" in record.getMessage()]
+
+
+def test_evaluation_reports_intervals_for_every_seed(finished, capsys):
+    run_dir, _ = finished
+    assert cli.main(["evaluate", str(run_dir), "--episodes", "5", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [row["seed"] for row in report["seeds"]] == [0, 1]
+    assert report["episodes"] == 10 and report["env_steps"] == 4 * EPOCH
+    for name in ("success_any", "success_final", "distance", "return"):
+        low, high = report[f"{name}_interval"]
+        assert low <= report[name] <= high
+    assert report["success_final"] <= report["success_any"]
+
+
+def test_evaluation_of_a_checkpoint_that_is_not_there_names_those_that_are(finished, capsys):
+    run_dir, _ = finished
+    assert cli.main(["evaluate", str(run_dir), "--checkpoint", "7"]) == 2
+    assert capsys.readouterr().err == f"error: --checkpoint: '7' is not among last, best, {2 * EPOCH}, {4 * EPOCH}\n"
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ({"controller__ppo__hidden": [16]}, "controller.ppo.hidden [8], not [16]"),
+        ({"env__options": {"episode_length": 120}}, "env.options"),
+        ({"trainer__num_envs": 8}, "trainer.num_envs 4, not 8"),
+        ({"trainer__seed": 3}, "trainer.seed 0, not 3"),
+    ],
+)
+def test_a_checkpoint_of_another_shape_or_environment_is_refused(finished, override, named):
+    run_dir, _ = finished
+    before = (run_dir / "metrics.jsonl").read_bytes()
+    with pytest.raises(ConfigError, match="its checkpoint was made with") as error:
+        trainer.train(tiny(**override), run_dir, resume=True, quiet=True)
+    assert named in str(error.value) and "\n" not in str(error.value)
+    assert (run_dir / "metrics.jsonl").read_bytes() == before
+
+
+def test_a_numeric_hyperparameter_may_change_on_resume(finished, tmp_path):
+    run_dir, _ = finished
+    checkpoints = Checkpoints(run_dir)
+    trainer.check_compatible(checkpoints.config(2 * EPOCH), tiny(tutor__reward_scale=3.0), source=run_dir)
+    checkpoints.close()
+
+
+def test_ctrl_c_writes_a_checkpoint_and_says_how_to_resume(tmp_path):
+    values = TINY | {"trainer": TINY["trainer"] | {"total_env_steps": 10**9, "eval_every": 10**6}}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
+    command = [sys.executable, "-m", "star.cli", "train", "config.yaml", "--run-dir", "run"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    metrics = tmp_path / "run" / "metrics.jsonl"
+    try:
+        while process.poll() is None and not (metrics.exists() and metrics.read_text().count("\n") > 4):
+            pass
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130, err
+    assert "star train --resume run" in out
+    assert len(Checkpoints(tmp_path / "run").steps()) >= 1
+
+
+def test_only_the_latest_checkpoints_and_the_best_are_kept(tmp_path):
+    program = trainer.build(tiny())
+    state = program.init(trainer.seed_keys(program))
+    checkpoints = Checkpoints(tmp_path, keep=2)
+    for step, success in ((1, 0.1), (2, 0.9), (3, 0.2), (4, 0.3), (5, 0.4)):
+        checkpoints.save(step, state, program.config, success=success)
+    assert checkpoints.steps() == [2, 4, 5]
+    assert checkpoints.best() == 2
+    checkpoints.close()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").rglob("*.yaml")), ids=lambda path: path.stem)
+def test_every_config_that_we_ship_is_valid(path):
+    load(path)
+
+
+def test_the_published_setting_trains(tmp_path):
+    small = {
+        "env.options": {"preset": "published", "episode_length": 20, "frames": 1},
+        "env.engine": "native",
+        "commander.period": 10,
+        "trainer.total_env_steps": 40,
+        "trainer.eval_every": 1,
+        "trainer.eval_episodes": 1,
+        "tutor.td3.hidden": [8],
+        "controller.td3.hidden": [8],
+        "tutor.td3.min_transitions": 1,
+        "controller.td3.min_transitions": 1,
+        "tutor.td3.buffer_size": 100,
+        "controller.td3.buffer_size": 100,
+        "forward_model.buffer_size": 100,
+        "forward_model.updates_per_epoch": 2,
+        "abstraction.max_regions": 6,
+        "refinement.depth": 1,
+        "refinement.pairs_per_epoch": 1,
+        "refinement.cuts_per_pair": 2,
+    }
+    result = trainer.train(load(ROOT / "configs" / "paper" / "ant_maze.yaml", small), tmp_path / "run", quiet=True)
+    assert result.env_steps == 40
+    last = rows(tmp_path / "run")[-1]
+    assert np.isfinite([last["controller/critic_loss"], last["tutor/critic_loss"], last["train/return"]]).all()
+
+
+def interrupt_after(monkeypatch, *, epochs):
+    """Press Ctrl-C during epoch number `epochs`."""
+    build = trainer.build
+
+    def pressing(config):
+        program = build(config)
+        calls = []
+
+        def epoch(state):
+            calls.append(None)
+            if len(calls) == epochs:
+                signal.raise_signal(signal.SIGINT)
+            return program.epoch(state)
+
+        return dataclasses.replace(program, epoch=epoch)
+
+    monkeypatch.setattr(trainer, "build", pressing)
+
+
+def assert_equal(one, other):
+    jax.tree.map(np.testing.assert_array_equal, one, other)

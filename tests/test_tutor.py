@@ -1,0 +1,113 @@
+"""The Tutor's view, subgoals, reward and off-policy correction."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from star import config, tutor
+from star.replay import Transition
+from star.tutor import Box, Trace
+
+N, L = 6, 4
+SCALE = np.array([10.0, 5.0], np.float32)
+
+
+def settings(**values):
+    return config.parse({"tutor": values}).tutor
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_it_sees_the_state_and_the_bounds_of_the_box(relative):
+    state, here = jnp.array([[1.0, 2.0, 7.0]]), jnp.array([[1.0, 2.0]])
+    box = Box(lower=jnp.array([[4.0, 4.0]]), upper=jnp.array([[8.0, 10.0]]))
+    seen = tutor.observe(settings(relative_bounds=relative), state, here, box)
+    bounds = [3, 2, 7, 8] if relative else [4, 4, 8, 10]
+    np.testing.assert_array_equal(seen, [[1, 2, 7, *bounds]])
+    np.testing.assert_array_equal(box.centre, [[6, 7]])
+
+
+def test_subgoals_are_clipped_to_their_scale():
+    actions = jnp.array([[0.5, -0.5], [3.0, -3.0]])
+    np.testing.assert_allclose(tutor.subgoal(actions, jnp.asarray(SCALE)), [[5, -2.5], [10, -5]])
+
+
+@pytest.mark.parametrize("reward", ["distance", "progress"])
+def test_the_reward_adds_up_the_steps_before_the_end(reward):
+    rng = np.random.default_rng(0)
+    distances = rng.random((L + 1, N)).astype(np.float32)
+    alive = (np.arange(L)[:, None] < np.array([0, 1, 2, 3, 4, 4])).astype(np.float32)
+    got = tutor.reward(settings(reward=reward, reward_scale=0.1), distances, alive)
+    for n in range(N):
+        steps = [t for t in range(L) if alive[t, n]]
+        if reward == "distance":
+            expected = -sum(distances[t + 1, n] for t in steps)
+        else:  # telescopes
+            expected = distances[0, n] - distances[len(steps), n]
+        np.testing.assert_allclose(got[n], 0.1 * expected, rtol=1e-4, atol=1e-6)
+
+
+def mean_action(states, subgoals):
+    """A policy that depends on both."""
+    return jnp.tanh(subgoals / 4) + 0.1 * states[..., :2]
+
+
+def replayed(rng, action):
+    path = np.cumsum(rng.normal(size=(N, L + 1, 2)), axis=1).astype(np.float32)
+    states = rng.normal(size=(N, L, 3)).astype(np.float32)
+    trace = Trace(states=states, actions=rng.normal(size=(N, L, 2)).astype(np.float32), achieved=path)
+    zero = np.zeros(N, np.float32)
+    return Transition(
+        obs=zero[:, None],
+        action=action,
+        reward=zero,
+        next_obs=zero[:, None],
+        terminated=zero,
+        cut=zero,
+        weight=zero + 1,
+        extras=trace,
+    )
+
+
+def slow_likelihood(trace, n, action):
+    """Up to constants, the log-probability of the Controller actions n under a subgoal that moves with the agent."""
+    total, subgoal = 0.0, action * SCALE
+    for t in range(L):
+        chosen = np.tanh(subgoal / 4) + 0.1 * trace.states[n, t, :2]
+        total -= 0.5 * ((trace.actions[n, t] - chosen) ** 2).sum()
+        subgoal = trace.achieved[n, t] + subgoal - trace.achieved[n, t + 1]
+    return total
+
+
+@pytest.fixture(scope="module")
+def correct():
+    chosen = settings(correction_candidates=10)
+    return jax.jit(lambda batch, key: tutor.correct(chosen, batch, jnp.asarray(SCALE), mean_action, key=key))
+
+
+def test_the_correction_keeps_the_candidate_that_makes_the_actions_most_likely(correct):
+    rng = np.random.default_rng(1)
+    batch = replayed(rng, rng.uniform(-1, 1, (N, 2)).astype(np.float32))
+    key = jax.random.key(0)
+    got = correct(batch, key)
+    moved = (batch.extras.achieved[:, -1] - batch.extras.achieved[:, 0]) / SCALE
+    drawn = moved + 0.5 * np.asarray(jax.random.normal(key, (10, N, 2)))
+    changed = 0
+    for n in range(N):
+        candidates = np.clip([batch.action[n], moved[n], *drawn[:, n]], -1, 1)
+        best = max(candidates, key=lambda action, n=n: slow_likelihood(batch.extras, n, action))
+        np.testing.assert_allclose(got.action[n], best, atol=1e-5)
+        changed += not np.allclose(best, batch.action[n])
+    assert changed
+    jax.tree.map(np.testing.assert_array_equal, got.replace(action=batch.action), batch)
+
+
+def test_the_stored_subgoal_is_kept_where_it_explains_the_actions_best(correct):
+    rng = np.random.default_rng(2)
+    action = rng.uniform(-0.6, 0.6, (N, 2)).astype(np.float32)
+    batch = replayed(rng, action)
+    path = batch.extras.achieved
+    subgoals = action[:, None] * SCALE + path[:, :1] - path[:, :-1]
+    done = np.asarray(mean_action(batch.extras.states, subgoals))
+    batch = batch.replace(extras=batch.extras.replace(actions=done))
+    np.testing.assert_allclose(correct(batch, jax.random.key(0)).action, action, atol=1e-6)
