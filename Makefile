@@ -1,6 +1,6 @@
 # The Python that .venv is made from (3.11 or 3.12), and what pytest is given.
 PYTHON ?= python3
-PYTEST_ARGS ?= -n 2
+PYTEST_ARGS ?= -n 2 --dist loadfile
 CONFIG ?= configs/point_maze.yaml
 
 VENV := .venv
@@ -21,7 +21,7 @@ quickstart: $(VENV)/.run ## install into .venv and train on the Point Maze (CONF
 	while [ -e "$$dir" ] && [ -n "$$(ls -A "$$dir")" ]; do dir=runs/quickstart-$$n; n=$$((n + 1)); done; \
 	set -x; $(BIN)/star train $(CONFIG) --run-dir "$$dir"
 
-test: lint ## lint, check the types, run the tests (PYTEST_ARGS="-n 2")
+test: lint ## lint, check the types, run the tests (PYTEST_ARGS=...)
 	$(BIN)/python -m mypy star envs
 	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
 

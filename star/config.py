@@ -88,7 +88,20 @@ class PPOConfig(Section):
     max_grad_norm: float = Field(1.0, gt=0, description="global gradient norm is clipped to this")
 
 
-class TD3Config(Section):
+class BufferedConfig(Section):
+    """Settings of what learns from batches of a buffer."""
+
+    batch_size: Positive = Field(128, description="transitions per update")
+    buffer_size: Positive = Field(200_000, description="transitions kept")
+
+    @model_validator(mode="after")
+    def _batch_fits_the_buffer(self) -> Self:
+        if self.batch_size > self.buffer_size:
+            raise ValueError(f"batch_size {self.batch_size} exceeds buffer_size {self.buffer_size}")
+        return self
+
+
+class TD3Config(BufferedConfig):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018), as published for STAR."""
 
     hidden: tuple[Positive, ...] = Field((300, 300), description="widths of the actor's and critics' layers")
@@ -96,8 +109,6 @@ class TD3Config(Section):
     critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step size of the critics")
     discount: float = Field(0.95, ge=0, le=1, description="gamma per decision of the level")
     tau: float = Field(0.005, gt=0, le=1, description="rate at which the target networks follow")
-    batch_size: Positive = Field(128, description="transitions per update")
-    buffer_size: Positive = Field(200_000, description="transitions kept in the replay buffer")
     min_transitions: Positive = Field(1000, description="transitions needed before the first update")
     updates_per_rollout: Positive = Field(10, description="gradient updates after each rollout")
     policy_delay: Positive = Field(2, description="critic updates per actor update")
@@ -169,7 +180,7 @@ class AbstractionConfig(Section):
     min_width: float = Field(1.0, gt=0, description="no region is cut narrower than this (units of the state)")
 
 
-class ForwardModelConfig(Section):
+class ForwardModelConfig(BufferedConfig):
     """F_k: predicts where k steps under a commanded region lead."""
 
     hidden: tuple[Positive, ...] = Field((32, 32), description="widths of the ReLU layers")

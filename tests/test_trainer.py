@@ -25,11 +25,11 @@ TIMES = ("wall_s", "env_steps_per_s")
 EPOCH = 4 * 60  # env steps
 
 TINY = {
-    "env": {"name": "point_maze", "options": {"episode_length": 60}},
+    "env": {"name": "point_maze", "engine": "jax", "options": {"episode_length": 60}},
     "commander": {"period": 20},
     "tutor": {"unroll": 3, "ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
     "controller": {"ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
-    "abstraction": {"max_regions": 8},
+    "abstraction": {"max_regions": 8, "cuts": [[8.0], [8.0]]},
     "forward_model": {"hidden": [8], "buffer_size": 64, "batch_size": 8, "updates_per_epoch": 2},
     "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
     "trainer": {
@@ -39,6 +39,7 @@ TINY = {
         "eval_episodes": 3,
         "checkpoint_every": 2,
         "num_seeds": 2,
+        "keep_checkpoints": 3,
     },
 }
 
@@ -56,10 +57,23 @@ def saved_state(config, run_dir):
     checkpoints = Checkpoints(run_dir)
     state = checkpoints.restore(checkpoints.steps()[-1], jax.eval_shape(program.init, trainer.seed_keys(program)))
     checkpoints.close()
-    return jax.tree.map(
-        lambda x: np.asarray(jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x),
-        state,
-    )
+    return jax.tree.map(np.asarray, state.replace(key=jax.random.key_data(state.key)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_once():
+    """Compiling takes nearly all the time of these tests, and a program has no state: equal configs share one."""
+    build, programs = trainer.build, {}
+
+    def shared(config):
+        key = config.to_yaml()
+        if key not in programs:
+            programs[key] = build(config)
+        return programs[key]
+
+    trainer.build = shared
+    yield
+    trainer.build = build
 
 
 @pytest.fixture(scope="module")
@@ -81,8 +95,6 @@ def test_a_run_leaves_config_metrics_checkpoints_and_figure(finished):
 def test_config_yaml_holds_every_resolved_value_and_can_be_trained_again(finished):
     run_dir, _ = finished
     config = load(run_dir / "config.yaml")
-    assert config.env.engine == "jax"
-    assert config.abstraction.cuts == ((8.0,), (8.0,))
     assert yaml.safe_load((run_dir / "config.yaml").read_text()) == config.model_dump(mode="json")
 
 
@@ -128,6 +140,12 @@ def test_metrics_written_after_the_checkpoint_are_dropped_on_resume(finished, tm
         file.write('{"env_steps": 1, "half a li')
     assert [row["env_steps"] for row in sink.keep_until(2 * EPOCH)] == [EPOCH, EPOCH, 2 * EPOCH, 2 * EPOCH]
     assert len(sink.path.read_text().splitlines()) == 4
+
+
+def test_auto_engine_and_the_cuts_of_the_task_are_resolved():
+    config = trainer.build(tiny(env__engine="auto", abstraction__cuts=None)).config
+    assert config.env.engine == "jax"
+    assert config.abstraction.cuts == ((8.0,), (8.0,))
 
 
 def test_nothing_is_compiled_after_the_first_epoch(caplog):
@@ -231,6 +249,9 @@ def test_the_published_setting_trains(tmp_path):
         "controller.td3.hidden": [8],
         "tutor.td3.min_transitions": 1,
         "controller.td3.min_transitions": 1,
+        "tutor.td3.batch_size": 8,
+        "controller.td3.batch_size": 8,
+        "forward_model.batch_size": 8,
         "tutor.td3.buffer_size": 100,
         "controller.td3.buffer_size": 100,
         "forward_model.buffer_size": 100,
