@@ -47,7 +47,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: list[str]) -> int:
     words, overrides = split_settings(arguments)
-    options = _parser().parse_args(words)
+    options, unknown = _parser().parse_known_args(words)
+    for word in unknown:
+        raise ConfigError(f"{word}: unknown argument; settings are given as --section.key VALUE")
     if options.command is None:
         _parser().print_help()
         return 0

@@ -57,6 +57,7 @@ class Display:
             disable=quiet or not console.is_terminal,
         )
         self._quiet = quiet
+        self._success: float | None = None
         self._task = self._progress.add_task(
             "compiling", total=total_env_steps, completed=done_env_steps, status="", start=False
         )
@@ -76,13 +77,15 @@ class Display:
         success = mean(rows, "eval/success_final")
         if success is not None:
             self._success = success
-        if getattr(self, "_success", None) is not None:
+        if self._success is not None:
             status += f"  success {self._success:.2f}"
         self._progress.start_task(self._task)
         self._progress.update(self._task, completed=env_steps, description="training", status=status)
         if success is not None and not self._quiet and not self._console.is_terminal:
             self._console.print(
-                f"{env_steps:,} / {self._total:,} env steps  {status}  {left_s:.0f} s left", highlight=False
+                f"{env_steps:,} / {self._total:,} env steps  {status}  {left_s:.0f} s left",
+                highlight=False,
+                soft_wrap=True,
             )
 
 

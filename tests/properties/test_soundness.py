@@ -66,7 +66,7 @@ def image_and_slopes(layers, residual, points):
     return x, np.abs(slopes).max(0)
 
 
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(
     architecture=st.sampled_from(ARCHITECTURES),
     seed=st.integers(0, 2**32 - 1),
