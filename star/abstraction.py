@@ -91,8 +91,9 @@ def locate(abstraction: Abstraction, point: Float[Array, "d"]) -> Int[Array, ""]
     nearest to it.
     """
     low, high = abstraction.space
-    inside = jnp.clip(point, low, jnp.nextafter(high, low))
-    holds = jnp.all((abstraction.lower <= inside) & (inside < abstraction.upper), axis=-1)
+    inside = jnp.clip(point, low, high)
+    below_upper = (inside < abstraction.upper) | (abstraction.upper >= high)
+    holds = jnp.all((abstraction.lower <= inside) & below_upper, axis=-1)
     return jnp.argmax(holds & abstraction.active)
 
 
