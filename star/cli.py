@@ -47,11 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: list[str]) -> int:
     words, overrides = split_settings(arguments)
-    options, unknown = _parser().parse_known_args(words)
+    parser = _parser()
+    options, unknown = parser.parse_known_args(words)
     for word in unknown:
         raise ConfigError(f"{word}: unknown argument; settings are given as --section.key VALUE")
     if options.command is None:
-        _parser().print_help()
+        parser.print_help()
         return 0
     flags = {name: _value(text) for name, text in vars(options).items() if "." in name and text is not None}
     return options.function(options, flags | overrides)

@@ -79,8 +79,9 @@ def _segment(
     began = streams.env.obs
     streams, steps = episode.rollout(config, spec, env, state, streams, subgoal, deterministic=False, key=rollout_key)
 
+    experience = _controller_rollout(config, spec, steps)
     controller_state, controller_metrics = learner.update(
-        config.controller, state.controller, _controller_rollout(config, spec, steps), key=update_key
+        config.controller, state.controller, experience, key=update_key
     )
     streams = episode.advance(config, streams)
     decision, outcome = _finished_period(config, spec, state, streams, steps)
@@ -89,7 +90,9 @@ def _segment(
         commander_state, _ = commander.update(config.commander, commander_state, allowed, decision)
     transition = _tutor_transition(config, spec, streams, began, tutor_action, steps)
     commander_state = commander_state.replace(chosen=commander_state.chosen.at[decision.target].add(decision.weight))
-    metrics = _prefix("controller", controller_metrics | {"reward": _controller_reward(config, steps)}) | {
+    metrics = _prefix(
+        "controller", controller_metrics | {"reward": _weighted(experience.reward, experience.weight)}
+    ) | {
         "tutor/reward": transition.reward.mean(),
         "env/terminated": (steps.terminated * steps.alive).mean(),
     }
@@ -101,7 +104,7 @@ def _segment(
 def _learn_between_episodes(
     config: AgentConfig, spec: Spec, state: TrainState, finished: tuple[Decision, Outcome], num_envs: int, *, key: Array
 ) -> tuple[TrainState, Metrics]:
-    """Train the forward model on the epoch's periods and refine the abstraction."""
+    """Let Commander and forward model learn from the epoch's periods, then refine the abstraction."""
     pick_key, train_key = jax.random.split(key)
     learn = commander.sweep if config.commander.sweeps else commander.update
     learnt, commander_metrics = learn(config.commander, state.commander, episode.successors(config, state), finished[0])
@@ -222,10 +225,6 @@ def _relabel(config: AgentConfig, spec: Spec, state: TrainState) -> Any:
 
 def _env_steps(spec: Spec, env: VectorEnv, state: TrainState) -> Float[Array, ""]:
     return state.epoch.astype(jnp.float32) * (spec.episode_length * env.num_envs)
-
-
-def _controller_reward(config: AgentConfig, steps: Steps) -> Array:
-    return _weighted(controller.reward(config.controller, steps.subgoal, steps.next_subgoal), steps.alive)
 
 
 def _episode_metrics(name: str, episode: Episode) -> Metrics:
