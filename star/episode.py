@@ -211,7 +211,7 @@ def advance(config: AgentConfig, streams: Streams) -> Streams:
     return streams.replace(clock=(streams.clock + config.tutor.period) % config.commander.period)
 
 
-def restart_ended(config: AgentConfig, env: VectorEnv, streams: Streams, steps: Steps, *, key: Array) -> Streams:
+def restart_ended(env: VectorEnv, streams: Streams, steps: Steps, *, key: Array) -> Streams:
     """Reset the environments that terminated in this segment, with clocks and statistics at their start."""
     ended = jnp.max(steps.terminated * steps.alive, axis=0) > 0
     env_state = env.reset_where(streams.env, ended, key)

@@ -96,7 +96,7 @@ def _segment(
         "tutor/reward": transition.reward.mean(),
         "env/terminated": (steps.terminated * steps.alive).mean(),
     }
-    streams = episode.restart_ended(config, env, streams, steps, key=reset_key)
+    streams = episode.restart_ended(env, streams, steps, key=reset_key)
     state = state.replace(controller=controller_state, commander=commander_state)
     return (state, streams), (transition, (decision, outcome), metrics)
 

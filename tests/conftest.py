@@ -14,7 +14,8 @@ from hypothesis import settings  # noqa: E402
 
 import envs  # noqa: E402
 import star.state  # noqa: E402
-from envs.maze import Geometry, Goals, MazeEnv  # noqa: E402
+from envs.maze import MazeEnv  # noqa: E402
+from envs.tasks import MAZE_GEOMETRY, MAZE_GOALS  # noqa: E402
 from star import config, episode, hierarchy  # noqa: E402
 
 settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
@@ -69,16 +70,9 @@ def tiny():
 def breaking_env():
     """Point Maze whose episodes end early, without truncation, in about half of all cases."""
     plain = envs.make("point_maze")
-    geometry = Geometry(
-        goal_indices=(0, 1),
-        success_radius=5.0,
-        abstract_indices=(0, 1),
-        space=((-4.0, -4.0), (20.0, 20.0)),
-        region_cuts=((8.0,), (8.0,)),
-        subgoal_scale=(10.0, 10.0),
+    env = MazeEnv(
+        "breaking", plain.arena, Fused(plain.body), MAZE_GOALS["train"], MAZE_GEOMETRY, episode_length=EPISODE
     )
-    goals = Goals(lower=(-4.0, -4.0), upper=(20.0, 20.0))
-    env = MazeEnv("breaking", plain.arena, Fused(plain.body), goals, geometry, episode_length=EPISODE)
     return envs.VectorEnv(env, NUM_ENVS, auto_reset=False)
 
 
@@ -108,7 +102,7 @@ def record(agent, spec, env, state, key):
             "tutor": hierarchy._tutor_transition(agent, spec, advanced, before.env.obs, action, steps),
             "controller": hierarchy._controller_rollout(agent, spec, steps),
         }
-        return episode.restart_ended(agent, env, advanced, steps, key=reset_key), saved
+        return episode.restart_ended(env, advanced, steps, key=reset_key), saved
 
     start_key, scan_key = jax.random.split(key)
     streams = episode.start(spec, env, state.abstraction, key=start_key)
