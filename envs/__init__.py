@@ -3,13 +3,31 @@
 >>> import envs
 >>> env = envs.VectorEnv(envs.make("point_maze"), 64)
 
-`envs` knows nothing of agents. See docs/environments.md for every task, option and convention.
+`envs` knows nothing of agents. See docs/environments.md for every task, option and convention. What needs JAX is
+imported when it is first used.
 """
 
-from envs import _quiet as _quiet  # first: the import that silences the ones below
-from envs.maze import MazeEnv
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from envs.options import EnvError
-from envs.tasks import make, names
-from envs.vector import VectorEnv
+from envs.tasks import names
+
+if TYPE_CHECKING:
+    from envs.build import make
+    from envs.maze import MazeEnv
+    from envs.vector import VectorEnv
 
 __all__ = ["EnvError", "MazeEnv", "VectorEnv", "make", "names"]
+
+_HOMES = {"make": "envs.build", "MazeEnv": "envs.maze", "VectorEnv": "envs.vector"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'envs' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value

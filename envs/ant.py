@@ -1,63 +1,161 @@
 """The ant: 8 motors, and the 30 numbers that the paper's agents observe.
 
     state = qpos[0:15], qvel[0:14], t * .001      t in env steps
-    start = qpos0 + U(-.1, .1), N(0, .1^2)        qpos0 has the torso at z = .75 and every joint at 0
+    start = qpos0 + U(-.1, .1), N(0, .1^2)        qpos0 has the torso .75 above the floor and every joint at 0
 
 qpos is x, y, z in m, a unit quaternion (w, x, y, z), then hip and ankle of legs 1 to 4 in rad; qvel is the velocity
-of the torso in m/s (world frame), its angular velocity in rad/s (body frame), then the 8 joint velocities, of which
-the last is not observed. Actions follow the order of the joints, 1 standing for 30 N m.
+of the torso in m/s (world frame), its angular velocity in rad/s (body frame), then the 8 joint velocities. Actions
+follow the order of the joints, 1 standing for 30 N m.
+
+What the task holds beside the ant is hidden from this state. The full one appends, for each block, how far it has
+slid along each of its axes and how fast, then 1 for each gate that is open.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import resources
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
+import numpy as np
 
-from envs.physics import Physics, PhysicsState
+from envs import scene
+from envs.arena import BLOCK
+from envs.physics import Physics, PhysicsState, resolve_engine
+from envs.tasks import PRESETS, Switch, Task
 
 MAX_TORQUE = 30.0  # N m
 START_POSITION = 0.1  # half-range of the start qpos, m and rad
 START_SPEED = 0.1  # standard deviation of the start qvel, m/s and rad/s
 STEP_SCALE = 0.001  # of the step count in the state
-OBSERVED_QPOS = 15
-OBSERVED_QVEL = 14
+QPOS, QVEL = 15, 14  # the ant's own positions and velocities; those of blocks follow
+ON_ITS_BACK = -0.5  # the ant is flipped when the vertical part of its own up axis is below
+LIFT = 2.0  # how far an open gate is lifted, in its own heights
+
+INTEGRATORS = {
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
+CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 
 
-def xml() -> str:
-    """The ant's own model, without floor or walls."""
-    return resources.files("envs").joinpath("assets", "ant.xml").read_text(encoding="utf-8")
+def spec(*, action_scale: float = 1.0, collisions: str = "all") -> mujoco.MjSpec:
+    """The ant's own model, without floor or walls. With `collisions="feet"` only torso and shins touch anything."""
+    xml = resources.files("envs").joinpath("assets", "ant.xml").read_text(encoding="utf-8")
+    ant = mujoco.MjSpec.from_string(xml)
+    for motor in ant.actuators:
+        motor.ctrlrange = action_scale * np.asarray(motor.ctrlrange)
+    for geom in ant.geoms:
+        if collisions == "feet" and not geom.name.startswith(("torso", "shin")):
+            geom.contype = 0
+    return ant
+
+
+def build(task: Task, engine: str, options: Mapping[str, Any]) -> Ant:
+    """The ant in the arena of `task`; raises `EnvError` if the engine cannot run here."""
+    given = {key: value for key, value in options.items() if value is not None}
+    chosen = {**PRESETS[options["preset"]], **given}
+    solver = {
+        "timestep": chosen["timestep"],
+        "integrator": INTEGRATORS[chosen["integrator"]],
+        "solver": SOLVERS[chosen["solver"]],
+        "cone": CONES[chosen["cone"]],
+        "iterations": chosen["iterations"],
+        "ls_iterations": chosen["ls_iterations"],
+    }
+    body = spec(action_scale=chosen["action_scale"], collisions=chosen["collisions"])
+    physics = Physics(
+        scene.build_model(task.arena, body, solver), engine=resolve_engine(engine), frames=chosen["frames"]
+    )
+    return Ant(physics, task, action_scale=chosen["action_scale"], full=chosen["observe"] == "full")
 
 
 class Ant:
-    """The body for `MazeEnv`: state of 30, 8 actions."""
+    """The body for `MazeEnv`: state of 30, more if `full`; 8 actions."""
 
-    state_dim = OBSERVED_QPOS + OBSERVED_QVEL + 1
-
-    def __init__(self, physics: Physics):
+    def __init__(self, physics: Physics, task: Task, *, action_scale: float = 1.0, full: bool = False):
         """Live in the model of `physics`, whose first 15 qpos, 14 qvel and 8 controls are the ant's."""
         self.physics = physics
-        self.model = physics.model
         self.action_size = physics.model.nu
         self.dt = physics.dt
         self.engine = physics.engine
-        self._start = jnp.asarray(physics.model.qpos0, jnp.float32)
+        self._arena = task.arena
+        self._switch: Switch | None = task.switch
+        self._block_noise = task.block_noise
+        self._full = full
+        self._max_torque = MAX_TORQUE * action_scale
+        self._closed = np.asarray(physics.mocap_pos)
+        self._lift = LIFT * task.arena.wall_height
+        self._blocks = len(task.arena.centres(BLOCK))
+        start = np.array(physics.model.qpos0)
+        start[2] += task.arena.floor_height
+        self._start = jnp.asarray(start, jnp.float32)
+        slides = 2 * (len(start) - QPOS)
+        self.state_dim = QPOS + QVEL + 1 + (slides + len(self._closed)) * full
 
-    def init(self, rng: jax.Array) -> PhysicsState:
-        """A noisy start at the origin."""
-        qpos_rng, qvel_rng = jax.random.split(rng)
-        noise = jax.random.uniform(qpos_rng, self._start.shape, minval=-START_POSITION, maxval=START_POSITION)
-        qpos = self._start + noise
-        attitude = qpos[3:7] / jnp.linalg.norm(qpos[3:7])
-        qvel = START_SPEED * jax.random.normal(qvel_rng, (self.model.nv,))
-        return self.physics.init(qpos.at[3:7].set(attitude), qvel)
+    def init(self, rng: jax.Array, position: jax.Array) -> PhysicsState:
+        """A noisy start at `position` [2]."""
+        qpos_rng, qvel_rng, block_rng = jax.random.split(rng, 3)
+        noise = jax.random.uniform(qpos_rng, (QPOS,), minval=-START_POSITION, maxval=START_POSITION)
+        qpos = self._start.at[:QPOS].add(noise).at[:2].add(position)
+        qpos = qpos.at[3:7].divide(jnp.linalg.norm(qpos[3:7]))
+        if self._block_noise:
+            first_x = QPOS + len(self._arena.block) * np.arange(self._blocks)
+            qpos = qpos.at[first_x].add(self._block_noise * jax.random.normal(block_rng, first_x.shape))
+        qvel = jnp.zeros(self.physics.model.nv).at[:QVEL].set(START_SPEED * jax.random.normal(qvel_rng, (QVEL,)))
+        return self.physics.init(qpos, qvel)
 
     def step(self, data: PhysicsState, action: jax.Array) -> PhysicsState:
-        """Hold the torques of `action` [8], in [-1, 1], for `dt` seconds."""
-        return self.physics.step(data, MAX_TORQUE * action)
+        """Hold the torques of `action` [8], in [-1, 1], for `dt` seconds, then lift the gate if it is time."""
+        data = self.physics.step(data, self._max_torque * action)
+        if self._switch is None:
+            return data
+        place = jnp.where(self._is_open(data) | self._at_switch(data), self._lift, 0.0)
+        return data.replace(mocap_pos=jnp.asarray(self._closed).at[:, 2].add(place))
 
     def observe(self, data: PhysicsState, steps: jax.Array) -> jax.Array:
-        """The state [30]."""
+        """The state [state_dim]."""
         clock = STEP_SCALE * steps.astype(jnp.float32)
-        return jnp.concatenate([data.qpos[:OBSERVED_QPOS], data.qvel[:OBSERVED_QVEL], clock[None]])
+        published = [data.qpos[:QPOS], data.qvel[:QVEL], clock[None]]
+        hidden = [data.qpos[QPOS:], data.qvel[QVEL:], self._is_open(data).astype(jnp.float32)]
+        return jnp.concatenate(published + hidden if self._full else published)
+
+    def displace(self, data: PhysicsState, offset: jax.Array) -> PhysicsState:
+        """The ant moved by `offset` [2]; the solver corrects what gets into a wall."""
+        return data.replace(qpos=data.qpos.at[:2].add(offset))
+
+    def flipped(self, data: PhysicsState) -> jax.Array:
+        """Whether the torso's own up axis points down."""
+        return 1.0 - 2.0 * (data.qpos[4] ** 2 + data.qpos[5] ** 2) < ON_ITS_BACK
+
+    def dropped(self, data: PhysicsState) -> jax.Array:
+        """Whether MJX-Warp ran out of room for contacts."""
+        return data.overflow > 0
+
+    def model(self) -> mujoco.MjModel:
+        """The model with a checkered floor."""
+        return scene.build_model(self._arena, spec(), {}, visual=True)
+
+    def pose(self, data: PhysicsState) -> tuple[jax.Array, jax.Array]:
+        """(qpos, mocap_pos)."""
+        return data.qpos, data.mocap_pos
+
+    def _is_open(self, data: PhysicsState) -> jax.Array:
+        """Whether each gate [n] is open."""
+        return data.mocap_pos[:, 2] > self._closed[:, 2] + self._lift / 2
+
+    def _at_switch(self, data: PhysicsState) -> jax.Array:
+        assert self._switch is not None
+        x, y, _, w, i, j, k = data.qpos[:7]
+        yaw = jnp.arctan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j**2 + k**2))
+        return at_switch(self._switch, jnp.stack([x, y])) & (self._switch.yaw[0] <= yaw) & (yaw <= self._switch.yaw[1])
+
+
+def at_switch(switch: Switch, position: jax.Array) -> jax.Array:
+    """Whether `position` [2] is where the gate opens."""
+    return ((jnp.asarray(switch.lower) <= position) & (position <= jnp.asarray(switch.upper))).all()

@@ -1,53 +1,100 @@
-"""Maze maps: rows of text, the rectangles they stand for, and the MuJoCo model of a body among them.
+"""Maze maps: rows of text, the rectangles they stand for, and where they come from.
 
-A map has a row of characters for each row of cells: `1` wall, `0` free, `r` free and the robot's cell. The centre
-of the robot's cell is the origin, +x runs right along a row, +y runs down the rows.
+A map has a row of characters for each row of cells:
+
+    1  wall            0  free             r  free, and the robot starts here      g  free, and a goal
+    #  no floor        B  movable block    D  gate (door)
+
+The centre of the first robot's cell is the origin, +x runs right along a row, +y runs down the rows. Walls, blocks
+and gates are half a cell high. Where a map has cells without floor, the floor of all others is raised by as much.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
+import yaml
 
-WALL = "1"
-ROBOT = "r"
-FLOOR_COLOUR = (0.8, 0.8, 0.8, 1.0)
-WALL_COLOUR = (0.4, 0.5, 0.6, 1.0)
+from envs.options import EnvError
+
+WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE = "10rg#BD"
+SYMBOLS = (WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE)
+HEIGHT = 0.5  # of walls, blocks, gates and the raised floor, in cells
+MAX_CELLS = 64  # along a side
+CELL_SIZES = (1.5, 100.0)  # m
+BLOCK_AXES = ("x", "y", "xy", "yz", "xz", "xyz")
+
+Cell = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class Arena:
-    """A maze. `rows` are strings of equal length, `cell` is the side of a cell and `wall_height` a height, in m."""
+    """A maze. `rows` are strings of equal length, `cell` is the side of a cell in m.
+
+    `block` names the axes along which the blocks `B` slide: some of x, y and z; along z they fall.
+    """
 
     rows: tuple[str, ...]
     cell: float
-    wall_height: float
+    block: str = "xy"
 
     @cached_property
-    def origin(self) -> tuple[int, int]:
-        """(row, column) of the robot's cell."""
-        return next((r, row.index(ROBOT)) for r, row in enumerate(self.rows) if ROBOT in row)
+    def origin(self) -> Cell:
+        """(row, column) of the first robot's cell."""
+        return next(self.cells(ROBOT))
+
+    @property
+    def wall_height(self) -> float:
+        """Height of the walls above the floor, in m."""
+        return HEIGHT * self.cell
+
+    @cached_property
+    def floor_height(self) -> float:
+        """Height of the floor, in m: 0 unless there are cells without floor."""
+        return HEIGHT * self.cell if any(self.cells(CHASM)) else 0.0
 
     @cached_property
     def bounds(self) -> np.ndarray:
         """The outline of the whole map, walls included: (x_lo, y_lo, x_hi, y_hi)."""
         return self._rectangle(0, 0, len(self.rows), len(self.rows[0]))
 
+    def cells(self, symbols: str) -> Iterator[Cell]:
+        """(row, column) of the cells that hold one of `symbols`, row by row."""
+        return ((r, c) for r, row in enumerate(self.rows) for c, symbol in enumerate(row) if symbol in symbols)
+
+    def centres(self, symbols: str) -> np.ndarray:
+        """Centres [n, 2] of the cells that hold one of `symbols`, in m."""
+        row, column = self.origin
+        return np.array([((c - column) * self.cell, (r - row) * self.cell) for r, c in self.cells(symbols)])
+
     def walls(self) -> np.ndarray:
         """Merged wall rectangles [n, 4] as (x_lo, y_lo, x_hi, y_hi); they cover the wall cells without overlap."""
-        return self._merged(lambda cell: cell == WALL)
+        return self._merged(lambda symbol: symbol == WALL)
 
     def free(self) -> np.ndarray:
         """Merged rectangles of the cells without a wall [n, 4], as (x_lo, y_lo, x_hi, y_hi)."""
-        return self._merged(lambda cell: cell != WALL)
+        return self._merged(lambda symbol: symbol != WALL)
+
+    def floors(self) -> np.ndarray:
+        """Merged rectangles of the cells with a floor and without a wall [n, 4]."""
+        return self._merged(lambda symbol: symbol not in (WALL, CHASM))
+
+    def chasms(self) -> np.ndarray:
+        """Merged rectangles of the cells without floor [n, 4]."""
+        return self._merged(lambda symbol: symbol == CHASM)
+
+    def gates(self) -> np.ndarray:
+        """Merged rectangles of the gates [n, 4]."""
+        return self._merged(lambda symbol: symbol == GATE)
 
     def _merged(self, wanted: Callable[[str], bool]) -> np.ndarray:
-        left = {(r, c) for r, row in enumerate(self.rows) for c, cell in enumerate(row) if wanted(cell)}
+        left = {(r, c) for r, row in enumerate(self.rows) for c, symbol in enumerate(row) if wanted(symbol)}
         rectangles = []
         while left:
             top, begin = min(left)
@@ -59,7 +106,7 @@ class Arena:
                 bottom += 1
             left -= {(r, c) for r in range(top, bottom) for c in range(begin, end)}
             rectangles.append(self._rectangle(top, begin, bottom, end))
-        return np.array(rectangles)
+        return np.array(rectangles).reshape(-1, 4)
 
     def _rectangle(self, top: int, left: int, bottom: int, right: int) -> np.ndarray:
         row, column = self.origin
@@ -67,36 +114,101 @@ class Arena:
         return (corners - 0.5) * self.cell
 
 
-def build_model(arena: Arena, body_xml: str, options: Mapping[str, Any]) -> mujoco.MjModel:
-    """The MuJoCo model of a body in an arena: floor at z = 0, one box for each merged wall.
+def read(source: str, *, cell: float) -> Arena:
+    """The arena of a user's map: a file, or the rows themselves if `source` has several lines.
 
-    Floor and walls take the contact parameters of the body's default class. They have contype 0 and conaffinity 1,
-    so that they never meet each other, and no margin of their own, so that contacts begin at the body's margin:
-    MuJoCo adds the margins of two geoms. `options` are attributes of `MjSpec.option`.
+    A file is either the rows as plain text, or YAML (`.yaml`, `.yml`) with the rows as a block of text under `map`
+    and, if wanted, `cell` (m) and `block` (axes). `cell` is the size of cells that the map does not give.
+
+    Raises:
+      EnvError: in one line that names the file, and the row and column counted from 1.
     """
-    spec = mujoco.MjSpec.from_string(body_xml)
-    for name, value in options.items():
-        setattr(spec.option, name, value)
-    static: dict[str, Any] = {"contype": 0, "conaffinity": 1, "margin": 0.0}
-    x_lo, y_lo, x_hi, y_hi = arena.bounds
-    middle, half = [(x_lo + x_hi) / 2, (y_lo + y_hi) / 2], [(x_hi - x_lo) / 2, (y_hi - y_lo) / 2]
-    world = spec.worldbody
-    world.add_light(pos=[*middle, 40.0], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
-    world.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        pos=[*middle, 0.0],
-        size=[*half, 0.1],
-        rgba=FLOOR_COLOUR,
-        **static,
-    )
-    for i, wall in enumerate(arena.walls()):
-        world.add_geom(
-            name=f"wall_{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[*(wall[:2] + wall[2:]) / 2, arena.wall_height / 2],
-            size=[*(wall[2:] - wall[:2]) / 2, arena.wall_height / 2],
-            rgba=WALL_COLOUR,
-            **static,
-        )
-    return spec.compile()
+    if "\n" in source.strip():
+        return check(Arena(_rows(source), cell), name="map")
+    path = Path(source)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise EnvError(f"map {source}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise EnvError(f"map {source}: is not a text file") from None
+    if path.suffix not in (".yaml", ".yml"):
+        return check(Arena(_rows(text), cell), name=f"map {source}")
+    return check(_from_yaml(text, cell, name=f"map {source}"), name=f"map {source}")
+
+
+def _rows(text: str) -> tuple[str, ...]:
+    return tuple(line.strip() for line in text.strip().splitlines())
+
+
+def _from_yaml(text: str, cell: float, *, name: str) -> Arena:
+    try:
+        values = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        raise EnvError(f"{name}: is not YAML" + (f", line {mark.line + 1}" if mark else "")) from None
+    if not isinstance(values, dict) or not isinstance(values.get("map"), str):
+        raise EnvError(f'{name}: needs the rows as a block of text: "map: |", then one line for each row')
+    given: dict[Any, Any] = {"cell": cell, "block": "xy"} | values
+    for key in given:
+        if key not in ("map", "cell", "block"):
+            raise EnvError(f'{name}: key "{key}" is unknown; allowed: map, cell, block')
+    if type(given["cell"]) not in (int, float) or not CELL_SIZES[0] <= given["cell"] <= CELL_SIZES[1]:
+        raise EnvError(f"{name}: cell is {given['cell']!r}; allowed: {CELL_SIZES[0]} to {CELL_SIZES[1]} m")
+    if given["block"] not in BLOCK_AXES:
+        raise EnvError(f"{name}: block is {given['block']!r}; allowed: {', '.join(BLOCK_AXES)}")
+    return Arena(_rows(values["map"]), float(given["cell"]), given["block"])
+
+
+def check(arena: Arena, *, name: str) -> Arena:
+    """`arena` itself, if a body can live in it; raises `EnvError` in one line that begins with `name`."""
+    rows = arena.rows
+    if not rows or not rows[0]:
+        raise EnvError(f"{name}: is empty")
+    if max(len(rows), len(rows[0])) > MAX_CELLS:
+        raise EnvError(f"{name}: has {len(rows)} rows of {len(rows[0])} cells; allowed: up to {MAX_CELLS} of each")
+    for r, row in enumerate(rows):
+        if len(row) != len(rows[0]):
+            raise EnvError(f"{name}: row {r + 1} has {len(row)} cells, row 1 has {len(rows[0])}")
+        for c, symbol in enumerate(row):
+            if symbol not in SYMBOLS:
+                raise EnvError(f"{name}: row {r + 1}, column {c + 1} is {symbol!r}; allowed: {' '.join(SYMBOLS)}")
+            if symbol != WALL and (r in (0, len(rows) - 1) or c in (0, len(row) - 1)):
+                raise EnvError(f"{name}: row {r + 1}, column {c + 1} is {symbol!r}; the outline must be walls (1)")
+    if not any(arena.cells(ROBOT)):
+        raise EnvError(f'{name}: has no start; mark the cell of the robot with "{ROBOT}"')
+    if not any(arena.cells(FREE + GOAL)):
+        raise EnvError(f'{name}: has no free cell beside the start; mark free cells with "{FREE}"')
+    reached = _walk(arena)
+    for r, c in arena.cells(GOAL):
+        if (r, c) not in reached:
+            raise EnvError(f'{name}: the goal at row {r + 1}, column {c + 1} cannot be reached from "{ROBOT}"')
+    return arena
+
+
+def farthest(arena: Arena) -> tuple[float, float]:
+    """Centre (x, y) of the free cell that is the longest walk from the robot's, in m; of several, the last."""
+    steps = _walk(arena)
+    r, c = max((cell for cell in steps if arena.rows[cell[0]][cell[1]] == FREE), key=lambda cell: (steps[cell], cell))
+    row, column = arena.origin
+    return ((c - column) * arena.cell, (r - row) * arena.cell)
+
+
+def _walk(arena: Arena) -> dict[Cell, int]:
+    """Steps from the robot to each cell it can walk to. A gate can open; a block that falls may bridge a chasm."""
+    bridged = any(arena.cells(BLOCK)) and "z" in arena.block
+    barred = WALL if bridged else WALL + CHASM
+    steps = {cell: 0 for cell in arena.cells(ROBOT)}
+    waiting = deque(steps)
+    while waiting:
+        r, c = waiting.popleft()
+        for near in ((r - 1, c), (r + 1, c), (r, c - 1), (r, c + 1)):
+            if near not in steps and arena.rows[near[0]][near[1]] not in barred:
+                steps[near] = steps[r, c] + 1
+                waiting.append(near)
+    return steps
+
+
+def resized(arena: Arena, cell: float) -> Arena:
+    """The same map with cells of `cell` m."""
+    return replace(arena, cell=cell)

@@ -21,10 +21,10 @@ def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
     def rule(axis_size: int, in_batched: Any, *args: Any) -> tuple[Any, Any]:
         def flatten(leaf: jax.Array, batched: bool) -> jax.Array:
             whole = leaf if batched else jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
-            return whole.reshape(-1, *whole.shape[2:])
+            return whole.reshape(whole.shape[0] * whole.shape[1], *whole.shape[2:])
 
         out = inner(*jax.tree.map(flatten, args, tuple(in_batched)))
-        out = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), out)
+        out = jax.tree.map(lambda leaf: leaf.reshape(axis_size, leaf.shape[0] // axis_size, *leaf.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
     return inner

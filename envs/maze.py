@@ -1,25 +1,27 @@
 """The maze environment: a body in an arena, a goal to reach.
 
     obs     = state, desired goal
-    reward  = - || achieved goal - desired goal ||        (r_ext of the paper, in m)
+    reward  = - || achieved goal - desired goal ||        (r_ext of the paper, in m; 1 or 0 for success if sparse)
     success = distance < success_radius, at this step
 
-An episode is truncated after `episode_length` steps. It is terminated only if the simulation turns non-finite;
-the observation then stays what it was, and stepping on stays terminated until the next reset.
+An episode is truncated after `episode_length` steps, and at once if the simulator fails: a state that is not finite,
+contacts that were dropped. The observation then stays what it was. With `flip` it also ends when the body turns over.
+An episode that has ended before its time stays as it is until the next reset.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
 from flax import struct
 
+from envs._quiet import Env, State
 from envs.arena import Arena
+from envs.tasks import Places, Task
 
 
 class Body(Protocol):
@@ -30,8 +32,8 @@ class Body(Protocol):
     dt: float
     engine: str
 
-    def init(self, rng: jax.Array) -> Any:
-        """The data at the start of an episode."""
+    def init(self, rng: jax.Array, position: jax.Array) -> Any:
+        """The data at the start of an episode, near `position` [2]."""
 
     def step(self, data: Any, action: jax.Array) -> Any:
         """The data `dt` seconds later; `action` [action_size] in [-1, 1]."""
@@ -39,42 +41,34 @@ class Body(Protocol):
     def observe(self, data: Any, steps: jax.Array) -> jax.Array:
         """The state [state_dim], `steps` env steps into the episode."""
 
+    def displace(self, data: Any, offset: jax.Array) -> Any:
+        """The data with the body moved by `offset` [2], in m."""
 
-@dataclass(frozen=True)
-class Goals:
-    """Desired goals: uniform in a box. `lower` and `upper` are corners over the goal dimensions, in m."""
+    def flipped(self, data: Any) -> jax.Array:
+        """Whether the body lies on its back (bool)."""
 
-    lower: tuple[float, ...]
-    upper: tuple[float, ...]
+    def dropped(self, data: Any) -> jax.Array:
+        """Whether the engine dropped contacts in the last step (bool)."""
 
-    def sample(self, rng: jax.Array) -> jax.Array:
-        """One goal [k]."""
-        lower, upper = jnp.asarray(self.lower, jnp.float32), jnp.asarray(self.upper, jnp.float32)
-        return jax.random.uniform(rng, lower.shape, minval=lower, maxval=upper)
+    def model(self) -> Any:
+        """A MuJoCo model to draw the task with."""
 
-
-@dataclass(frozen=True)
-class Geometry:
-    """What a hierarchical agent is told of a task; indices are those of the state.
-
-    `space` is (lower, upper) of the abstract dimensions, `region_cuts` the interior cuts of each of them, which
-    give the first regions, `subgoal_scale` the half-range of a subgoal along each.
-    """
-
-    goal_indices: tuple[int, ...]
-    success_radius: float
-    abstract_indices: tuple[int, ...]
-    space: tuple[tuple[float, ...], tuple[float, ...]]
-    region_cuts: tuple[tuple[float, ...], ...]
-    subgoal_scale: tuple[float, ...]
+    def pose(self, data: Any) -> tuple[Any, Any]:
+        """(qpos, mocap_pos) of `data` in that model."""
 
 
 @struct.dataclass
 class Simulation:
-    """The body's data, and the env steps since the last reset (int32)."""
+    """The body's data, the env steps since the last reset (int32), and the key of the noise on positions (raw).
+
+    `ended` is 1.0 if the episode has ended before its time, `terminated` 1.0 if the task ended it.
+    """
 
     data: Any
     steps: jax.Array
+    ended: jax.Array
+    terminated: jax.Array
+    noise: jax.Array
 
 
 class MazeEnv(Env):
@@ -83,21 +77,40 @@ class MazeEnv(Env):
     For a batch use `envs.VectorEnv`, which stays one physics batch under any number of outer vmaps.
     """
 
-    def __init__(self, name: str, arena: Arena, body: Body, goals: Goals, geometry: Geometry, *, episode_length: int):
+    def __init__(
+        self,
+        name: str,
+        task: Task,
+        body: Body,
+        *,
+        goals: str,
+        start: str,
+        episode_length: int,
+        reward: str,
+        success_radius: float,
+        flip: str = "ignore",
+        position_noise: float = 0.0,
+    ):
+        """`task` is a row of the registry; the other arguments are options of docs/environments.md."""
         self.name = name
-        self.arena = arena
+        self.arena: Arena = task.arena
         self.episode_length = episode_length
         self.engine = body.engine
         self.state_dim = body.state_dim
         self.dt = body.dt
+        self.success_radius = success_radius
+        geometry = task.geometry
         self.goal_indices = geometry.goal_indices
-        self.success_radius = geometry.success_radius
         self.abstract_indices = geometry.abstract_indices
         self.space = tuple(np.asarray(corner, np.float32) for corner in geometry.space)
         self.region_cuts = geometry.region_cuts
         self.subgoal_scale = geometry.subgoal_scale
         self._body = body
-        self._goals = goals
+        self._goals = task.goals[goals]
+        self._starts = task.starts[start]
+        self._sparse = reward == "sparse"
+        self._flip = flip
+        self._position_noise = position_noise
 
     @property
     def observation_size(self) -> int:
@@ -119,48 +132,98 @@ class MazeEnv(Env):
         """What moves in the maze."""
         return self._body
 
+    @cached_property
+    def model(self) -> Any:
+        """A `mujoco.MjModel` to draw the task with; `pose` says how."""
+        return self._body.model()
+
+    def pose(self, data: Any) -> tuple[Any, Any]:
+        """(qpos [nq], mocap_pos [nmocap, 3]) that show the body's `data`, of one environment, in `model`."""
+        return self._body.pose(data)
+
+    def reward(self, achieved: Any, desired: Any) -> Any:
+        """The reward [...] for goals [..., k] of NumPy or JAX, under the task's options."""
+        distance = _distance(achieved, desired)
+        return (distance < self.success_radius).astype(distance.dtype) if self._sparse else -distance
+
     def reset(self, rng: jax.Array) -> State:
         """A new episode with a new goal; `rng` is a typed or a raw key."""
-        body_rng, goal_rng = jax.random.split(rng)
+        body_rng, goal_rng, start_rng, noise_rng = jax.random.split(rng, 4)
         steps = jnp.zeros((), jnp.int32)
-        data = self._body.init(body_rng)
-        goal = self._goals.sample(goal_rng)
+        data = self._body.init(body_rng, sample(self._starts, start_rng))
+        goal = sample(self._goals, goal_rng)
         obs = jnp.concatenate([self._body.observe(data, steps), goal])
+        noise = noise_rng if jnp.issubdtype(noise_rng.dtype, jnp.uint32) else jax.random.key_data(noise_rng)
+        zero = jnp.zeros(())
         return State(
-            pipeline_state=Simulation(data=data, steps=steps),
+            pipeline_state=Simulation(data=data, steps=steps, ended=zero, terminated=zero, noise=noise),
             obs=obs,
-            reward=jnp.zeros(()),
-            done=jnp.zeros(()),
-            metrics=self._metrics(obs),
-            info={"steps": steps, "truncation": jnp.zeros(()), "goal": goal},
+            reward=zero,
+            done=zero,
+            metrics=self._metrics(obs) | {"non_finite": zero, "overflow": zero, "flipped": zero},
+            info={"steps": steps, "truncation": zero, "goal": goal},
         )
 
     def step(self, state: State, action: jax.Array) -> State:
         """One env step of `dt` seconds; `action` [action_size] is clipped to [-1, 1]."""
-        data = self._body.step(state.pipeline_state.data, jnp.clip(action, -1.0, 1.0))
-        steps = state.pipeline_state.steps + 1
+        before = state.pipeline_state
+        data, noise = self._shaken(self._body.step(before.data, jnp.clip(action, -1.0, 1.0)), before.noise)
+        steps = before.steps + 1
         seen = self._body.observe(data, steps)
-        finite = _all_finite(data) & jnp.isfinite(seen).all()
-        obs = jnp.where(finite, jnp.concatenate([seen, state.info["goal"]]), state.obs)
-        metrics = self._metrics(obs)
-        truncated = finite & (steps >= self.episode_length)
+        non_finite = ~(_all_finite(data) & jnp.isfinite(seen).all())
+        overflow = ~non_finite & self._body.dropped(data)
+        flipped = ~non_finite & self._body.flipped(data)
+        going, failed = before.ended == 0, non_finite | overflow
+        terminated = (before.terminated > 0) | (going & ~failed & flipped & (self._flip == "terminate"))
+        ended = ~going | failed | terminated | (flipped & (self._flip == "truncate"))
+        done = ended | (steps >= self.episode_length)
+        obs = jnp.where(going & ~failed, jnp.concatenate([seen, state.info["goal"]]), state.obs)
+        metrics = self._metrics(obs) | {
+            "non_finite": (going & non_finite).astype(jnp.float32),
+            "overflow": (going & overflow).astype(jnp.float32),
+            "flipped": flipped.astype(jnp.float32),
+        }
         info = {
             "steps": steps.astype(state.info["steps"].dtype),
-            "truncation": truncated.astype(jnp.float32),
+            "truncation": (done & ~terminated).astype(jnp.float32),
         }
+        flags = {"ended": ended.astype(jnp.float32), "terminated": terminated.astype(jnp.float32)}
         return state.replace(
-            pipeline_state=Simulation(data=data, steps=steps),
+            pipeline_state=Simulation(data=data, steps=steps, noise=noise, **flags),
             obs=obs,
-            reward=-metrics["distance"],
-            done=(truncated | ~finite).astype(jnp.float32),
+            reward=self.reward(obs[np.asarray(self.goal_indices)], obs[self.state_dim :]),
+            done=done.astype(jnp.float32),
             metrics={**state.metrics, **metrics},
             info={**state.info, **info},
         )
 
+    def _shaken(self, data: Any, noise: jax.Array) -> tuple[Any, jax.Array]:
+        """`data` with noise on the body's position, and the next key."""
+        if not self._position_noise:
+            return data, noise
+        noise, now = jax.random.split(noise)
+        return self._body.displace(data, self._position_noise * jax.random.normal(now, (2,))), noise
+
     def _metrics(self, obs: jax.Array) -> dict[str, jax.Array]:
-        achieved = obs[np.asarray(self.goal_indices)]
-        distance = jnp.linalg.norm(achieved - obs[self.state_dim :])
+        distance = _distance(obs[np.asarray(self.goal_indices)], obs[self.state_dim :])
         return {"distance": distance, "success": (distance < self.success_radius).astype(jnp.float32)}
+
+
+def sample(places: Places, rng: jax.Array) -> jax.Array:
+    """One point [k] of `places`."""
+    lower, upper = np.asarray(places.lower, np.float32), np.asarray(places.upper, np.float32)
+    sides = upper - lower
+    volume = np.where(sides > 0, sides, 1.0).prod(axis=1) * (sides > 0).any(axis=1)
+    share = volume / volume.sum() if volume.any() else np.full(len(lower), 1 / len(lower))
+    choice_rng, point_rng = jax.random.split(rng)
+    i = jnp.searchsorted(jnp.cumsum(jnp.asarray(share)), jax.random.uniform(choice_rng))
+    i = jnp.minimum(i, len(lower) - 1)
+    low, high = jnp.asarray(lower)[i], jnp.asarray(upper)[i]
+    return low + (high - low) * jax.random.uniform(point_rng, low.shape)
+
+
+def _distance(achieved: Any, desired: Any) -> Any:
+    return ((achieved - desired) ** 2).sum(axis=-1) ** 0.5
 
 
 def _all_finite(data: Any) -> jax.Array:

@@ -41,6 +41,12 @@ def duration(default: float | None) -> Option:
     )
 
 
+def number(default: float | None, low: float, high: float, unit: str = "") -> Option:
+    """A number from `low` to `high`."""
+    words = f"a number from {low:g} to {high:g}" + (f" {unit}" if unit else "")
+    return Option(default, lambda value: type(value) in (int, float) and low <= value <= high, words)
+
+
 def resolve(task: str, options: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:
     """The value of every option: as given, else its default.
 

@@ -4,9 +4,9 @@
     jax      MJX; any accelerator, bit-reproducible
     warp     MJX-Warp; NVIDIA GPUs, by far the fastest there, not bit-reproducible
 
-Between env steps only position, velocity and the solver's warm start are kept: a step first derives everything else
-from them, so that a reset is complete once these are replaced. Every engine steps a flat batch; vmaps are flattened
-into it (`batching.flattened`).
+Between env steps only position, velocity, the solver's warm start and the places of mocap bodies are kept: a step
+first derives everything else from them, so that a reset is complete once these are replaced. Every engine steps a
+flat batch; vmaps are flattened into it (`batching.flattened`).
 """
 
 from __future__ import annotations
@@ -22,13 +22,19 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from mujoco import mjx, rollout
+from mujoco import rollout
 
+from envs._quiet import mjx
 from envs.batching import flattened
 from envs.options import EnvError
 
 CONTACTS = 24  # per environment; MJX-Warp pools them over the batch
 CONSTRAINT_ROWS = 96  # per environment, MJX-Warp
+BLOCK_CONTACTS = 16  # more of them for each block, with 4 rows each
+MIN_POOL = 512  # contacts of a batch, however small
+OVERFLOW_BITS = 0b111111  # buffers of MJX-Warp that were too small: constraint rows, contacts, convex collisions
+
+_POOL = 512  # contacts of a batch, however small
 OVERFLOW_BITS = 0b111111  # buffers of MJX-Warp that were too small: constraint rows, contacts, convex collisions
 
 INTEGRATORS = {
@@ -37,6 +43,7 @@ INTEGRATORS = {
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
 }
 SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
+CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 
 _POOL = threading.Lock()  # mujoco.rollout has one thread pool for the process, and runs one rollout at a time
 
@@ -45,13 +52,14 @@ _POOL = threading.Lock()  # mujoco.rollout has one thread pool for the process, 
 class PhysicsState:
     """All that one simulation carries from step to step.
 
-    qpos [nq] and qvel [nv] are MuJoCo's. `warmstart` [nv] is the acceleration the solver starts from; native MuJoCo
-    keeps it at 0 and warms up within an env step. `overflow` [] is 1.0 if contacts were dropped in the last step
-    because MJX-Warp's buffers were full, else 0.0.
+    qpos [nq], qvel [nv] and mocap_pos [nmocap, 3] are MuJoCo's. `warmstart` [nv] is the acceleration the solver
+    starts from; native MuJoCo keeps it at 0 and warms up within an env step. `overflow` [] is 1.0 if contacts were
+    dropped in the last step because MJX-Warp's buffers were full, else 0.0.
     """
 
     qpos: jax.Array
     qvel: jax.Array
+    mocap_pos: jax.Array
     warmstart: jax.Array
     overflow: jax.Array
 
@@ -70,11 +78,18 @@ class Physics:
         self.model = model
         self.engine = engine
         self.dt = frames * model.opt.timestep
+        self.mocap_pos = model.body_pos[model.body_mocapid >= 0].astype(np.float32)
         self._step = flattened(_ENGINES[engine](model, frames))
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """A simulation at rest in every respect but position [nq] and velocity [nv]."""
-        return PhysicsState(qpos=qpos, qvel=qvel, warmstart=jnp.zeros_like(qvel), overflow=jnp.zeros(()))
+        """A simulation at rest in every respect but position [nq] and velocity [nv]; mocap bodies at their places."""
+        return PhysicsState(
+            qpos=qpos,
+            qvel=qvel,
+            mocap_pos=jnp.asarray(self.mocap_pos),
+            warmstart=jnp.zeros_like(qvel),
+            overflow=jnp.zeros(()),
+        )
 
     def step(self, data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         """`dt` seconds under constant controls [nu]. A simulation that diverges turns non-finite, and remains so."""
@@ -82,13 +97,8 @@ class Physics:
         return jax.tree.map(lambda leaf: leaf[0], batch)
 
 
-def engines() -> tuple[str, ...]:
-    """The names that `resolve_engine` knows."""
-    return ("auto", *_ENGINES)
-
-
 def resolve_engine(engine: str) -> str:
-    """The engine to use on this machine: for `auto` the fastest, else `engine` itself, one of `engines()`.
+    """The engine to use on this machine: for `auto` the fastest, else `engine` itself, one of `tasks.ENGINES`.
 
     Raises:
       EnvError: if the package or the device that `warp` needs is missing.
@@ -112,16 +122,19 @@ def _native(model: mujoco.MjModel, frames: int) -> StepBatch:
     """MuJoCo in C: `mujoco.rollout` over all cores this process may use, called from the compiled program."""
     threads = [mujoco.MjData(model) for _ in os.sched_getaffinity(0)]
     split = np.cumsum([1, model.nq, model.nv])  # MuJoCo's state is time, qpos, qvel
-    idle = np.concatenate([[0.0], model.qpos0, np.zeros(model.nv + model.nu)])
+    inputs = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_MOCAP_POS
+    idle = np.concatenate([[0.0], model.qpos0, np.zeros(model.nv + model.nu + 3 * model.nmocap)])
     duration = frames * model.opt.timestep
 
-    def advance(qpos: Any, qvel: Any, ctrl: Any) -> tuple[np.ndarray, np.ndarray]:
-        start = np.hstack([np.zeros((len(qpos), 1)), qpos, qvel, ctrl])
+    def advance(qpos: Any, qvel: Any, ctrl: Any, mocap_pos: Any) -> tuple[np.ndarray, np.ndarray]:
+        start = np.hstack([np.zeros((len(qpos), 1)), qpos, qvel, ctrl, np.reshape(mocap_pos, (len(qpos), -1))])
         broken = ~np.isfinite(start).all(axis=1)
         start[broken] = idle  # MuJoCo would log a warning for each of them
-        controls = np.repeat(start[:, None, split[2] :], frames, axis=1)
+        held = np.repeat(start[:, None, split[2] :], frames, axis=1)
         with _POOL:
-            states, _ = rollout.rollout(model, threads, start[:, : split[2]], controls, persistent_pool=True)
+            states, _ = rollout.rollout(
+                model, threads, start[:, : split[2]], held, control_spec=inputs, persistent_pool=True
+            )
         end = states[:, -1]
         broken |= end[:, 0] < duration - model.opt.timestep / 2  # cut short: MuJoCo found it unstable
         end[broken] = np.nan
@@ -130,8 +143,8 @@ def _native(model: mujoco.MjModel, frames: int) -> StepBatch:
 
     def step(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         shapes = tuple(jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in (data.qpos, data.qvel))
-        qpos, qvel = jax.pure_callback(advance, shapes, data.qpos, data.qvel, ctrl)
-        return PhysicsState(qpos, qvel, data.warmstart, data.overflow)
+        qpos, qvel = jax.pure_callback(advance, shapes, data.qpos, data.qvel, ctrl, data.mocap_pos)
+        return data.replace(qpos=qpos, qvel=qvel)
 
     return step
 
@@ -154,12 +167,16 @@ def _warp(model: mujoco.MjModel, frames: int) -> StepBatch:
     warp.config.log_level = warp.LOG_WARNING  # it would report every kernel that it compiles
     device_model = mjx.put_model(model, impl="warp").tree_replace({"opt._impl.warn_overflow": 0})
 
+    blocks = int(((model.geom_contype > 0) & (model.geom_conaffinity > 0)).sum())  # they meet everything
+    contacts = CONTACTS + blocks * BLOCK_CONTACTS
+    rows = CONSTRAINT_ROWS + blocks * 4 * BLOCK_CONTACTS
+
     def overflow(full: mjx.Data) -> jax.Array:
         return ((full._impl.overflow & OVERFLOW_BITS) != 0).astype(jnp.float32)
 
     def step(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         with jax.ensure_compile_time_eval():
-            blank = mjx.make_data(model, impl="warp", naconmax=len(ctrl) * CONTACTS, njmax=CONSTRAINT_ROWS)
+            blank = mjx.make_data(model, impl="warp", naconmax=max(len(ctrl) * contacts, MIN_POOL), njmax=rows)
         return _mjx_step(device_model, jax.tree.map(_as_fill, blank), frames, overflow, data, ctrl)
 
     return step
@@ -183,9 +200,11 @@ def _mjx_step(
     """Step the batch [n], each simulation starting from `blank`; `overflow` reads the flag off the last frame."""
 
     def simulate(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
-        full = blank.replace(qpos=data.qpos, qvel=data.qvel, qacc_warmstart=data.warmstart, ctrl=ctrl)
+        full = blank.replace(
+            qpos=data.qpos, qvel=data.qvel, mocap_pos=data.mocap_pos, qacc_warmstart=data.warmstart, ctrl=ctrl
+        )
         full = jax.lax.fori_loop(0, frames, lambda _, full: mjx.step(model, full), full)
-        return PhysicsState(full.qpos, full.qvel, full.qacc_warmstart, overflow(full))
+        return PhysicsState(full.qpos, full.qvel, data.mocap_pos, full.qacc_warmstart, overflow(full))
 
     # The dynamics need whole float32 products, which NVIDIA GPUs do not give by default.
     with jax.default_matmul_precision("highest"):

@@ -1,47 +1,25 @@
-"""The registry: one row of data for each task, and `make`, which turns a row into an environment."""
+"""The registry: one row of data for each task. Nothing here needs JAX or MuJoCo.
+
+A row is written in m at the row's own size of cells; `Task.resized` scales it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from envs import ant
-from envs.arena import Arena, build_model
-from envs.maze import Body, Geometry, Goals, MazeEnv
-from envs.options import EnvError, Option, choice, count, duration, known, resolve
-from envs.physics import INTEGRATORS, SOLVERS, Physics, engines, resolve_engine
-from envs.point import Point
+from envs import arena as arenas
+from envs.arena import CELL_SIZES, FREE, GOAL, ROBOT, Arena
+from envs.options import Option, choice, count, duration, number
 
+Point = tuple[float, ...]
 
-@dataclass(frozen=True)
-class Task:
-    """A row of the registry. `goals` names the sets of goals, the first being the default."""
-
-    arena: Arena
-    geometry: Geometry
-    goals: Mapping[str, Goals]
-    build: Callable[[Arena, str, Mapping[str, Any]], Body]
-    engines: tuple[str, ...]
-    options: Mapping[str, Option]
-
-
-MAZE = Arena(rows=("11111", "1r001", "11101", "10001", "11111"), cell=8.0, wall_height=4.0)
-
-MAZE_GEOMETRY = Geometry(
-    goal_indices=(0, 1),
-    success_radius=5.0,
-    abstract_indices=(0, 1),
-    space=((-4.0, -4.0), (20.0, 20.0)),
-    region_cuts=((8.0,), (8.0,)),
-    subgoal_scale=(10.0, 10.0),
-)
-
-MAZE_GOALS = {
-    "train": Goals(lower=(-4.0, -4.0), upper=(20.0, 20.0)),
-    "test": Goals(lower=(0.0, 16.0), upper=(0.0, 16.0)),
-}
-
+CLEARANCE = {"ant": 1.0, "point": 0.5}  # m that a body keeps from the sides of a cell when it starts anywhere
+INTEGRATORS = ("implicitfast", "euler", "rk4")
+SOLVERS = ("newton", "cg")
+CONES = ("pyramidal", "elliptic")
+ENGINES = ("auto", "native", "jax", "warp")
 
 # `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
 # MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both.
@@ -50,86 +28,327 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},
 }
 
-ANT_OPTIONS = {
+
+@dataclass(frozen=True)
+class Places:
+    """A distribution of points: uniform over a union of boxes, or over their corners if all are points.
+
+    `lower` and `upper` are corners of the boxes, in m. A box is chosen by its volume, each with the same probability
+    if none has any.
+    """
+
+    lower: tuple[Point, ...]
+    upper: tuple[Point, ...]
+
+    def resized(self, ratio: float) -> Places:
+        """All places `ratio` times as far from the origin."""
+        return Places(_scaled(self.lower, ratio), _scaled(self.upper, ratio))
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """What a hierarchical agent is told of a task; indices are those of the state.
+
+    `space` is (lower, upper) of the abstract dimensions, `region_cuts` the interior cuts of each of them, which
+    give the first regions, `subgoal_scale` the half-range of a subgoal along each.
+    """
+
+    goal_indices: tuple[int, ...]
+    abstract_indices: tuple[int, ...]
+    space: tuple[Point, Point]
+    region_cuts: tuple[Point, ...]
+    subgoal_scale: Point
+
+    def resized(self, ratio: float) -> Geometry:
+        """The same geometry at `ratio` times the size."""
+        lower, upper = _scaled(self.space, ratio)
+        return replace(
+            self,
+            space=(lower, upper),
+            region_cuts=_scaled(self.region_cuts, ratio),
+            subgoal_scale=_scaled((self.subgoal_scale,), ratio)[0],
+        )
+
+
+@dataclass(frozen=True)
+class Switch:
+    """Where a gate opens: positions between `lower` and `upper` (x, y) in m and, for a body that has one, the yaw."""
+
+    lower: Point
+    upper: Point
+    yaw: tuple[float, float]
+
+    def resized(self, ratio: float) -> Switch:
+        """The same switch at `ratio` times the size."""
+        return replace(self, lower=_scaled((self.lower,), ratio)[0], upper=_scaled((self.upper,), ratio)[0])
+
+
+@dataclass(frozen=True)
+class Task:
+    """A row of the registry.
+
+    `goals` names the distributions of the desired goal, the first being the default; `starts` those of the body's
+    position (x, y). `block_noise` is the standard deviation, in m, of a block's start along x. `defaults` are
+    options whose default is not the usual one, `maps` tells whether a map of the user's own may take the row's place.
+    """
+
+    body: str
+    arena: Arena
+    geometry: Geometry
+    success_radius: float
+    goals: Mapping[str, Places]
+    starts: Mapping[str, Places]
+    switch: Switch | None = None
+    block_noise: float = 0.0
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    maps: bool = False
+
+    def resized(self, cell: float) -> Task:
+        """The task with cells of `cell` m. The success radius stays."""
+        ratio = cell / self.arena.cell
+        return replace(
+            self,
+            arena=arenas.resized(self.arena, cell),
+            geometry=self.geometry.resized(ratio),
+            goals={name: places.resized(ratio) for name, places in self.goals.items()},
+            starts={name: places.resized(ratio) for name, places in self.starts.items()},
+            switch=self.switch and self.switch.resized(ratio),
+        )
+
+    @property
+    def engines(self) -> tuple[str, ...]:
+        """The engines to choose from."""
+        return ENGINES if self.body == "ant" else ("auto", "jax")
+
+    def options(self) -> dict[str, Option]:
+        """The options of the task with their defaults."""
+        options = {"goals": choice(*self.goals), "start": choice(*self.starts)} | COMMON
+        if self.maps:
+            options |= {"map": MAP}
+        if self.body == "ant":
+            options |= ANT
+        return options | {key: replace(options[key], default=value) for key, value in self.defaults.items()}
+
+
+def _scaled(points: Iterable[Point], ratio: float) -> Any:
+    return tuple(tuple(ratio * x for x in point) for point in points)
+
+
+MAP = Option(None, lambda value: isinstance(value, str) and bool(value), "the path of a map, or its rows")
+
+COMMON: Mapping[str, Option] = {
     "episode_length": count(500),
+    "observe": choice("published", "full"),
+    "reward": choice("distance", "sparse"),
+    "success_radius": number(None, 0.01, 100.0, "m"),
+    "cell": number(None, *CELL_SIZES, "m"),
+    "action_scale": number(1.0, 0.01, 10.0),
+    "position_noise": number(0.0, 0.0, 1.0, "m"),
+}
+
+ANT: Mapping[str, Option] = {
+    "flip": choice("ignore", "terminate", "truncate"),
     "preset": choice(*PRESETS),
+    "collisions": choice("all", "feet"),
     "timestep": duration(0.02),
     "frames": count(5),
     "solver": choice(*SOLVERS),
+    "cone": choice(*CONES),
     "integrator": replace(choice(*INTEGRATORS), default=None),  # None: that of the preset
     "iterations": count(None),
     "ls_iterations": count(None),
 }
 
 
-def _point(arena: Arena, engine: str, options: Mapping[str, Any]) -> Body:
-    return Point(arena.walls())
+def box(lower: Point, upper: Point) -> Places:
+    """Uniform in one box."""
+    return Places((lower,), (upper,))
 
 
-def _ant(arena: Arena, engine: str, options: Mapping[str, Any]) -> Body:
-    given = {key: value for key, value in options.items() if value is not None}
-    chosen = {**PRESETS[options["preset"]], **given}
-    model = build_model(
-        arena,
-        ant.xml(),
-        {
-            "timestep": chosen["timestep"],
-            "integrator": INTEGRATORS[chosen["integrator"]],
-            "solver": SOLVERS[chosen["solver"]],
-            "iterations": chosen["iterations"],
-            "ls_iterations": chosen["ls_iterations"],
-        },
+def point(*coordinates: float) -> Places:
+    """Always the same point."""
+    return box(coordinates, coordinates)
+
+
+def centres(arena: Arena, symbols: str) -> Places:
+    """The centres of the cells that hold one of `symbols`, all alike."""
+    found = tuple(tuple(map(float, centre)) for centre in arena.centres(symbols))
+    return Places(found, found)
+
+
+def around(arena: Arena, symbols: str, *, clearance: float, height: Point = ()) -> Places:
+    """Anywhere in the cells that hold one of `symbols`, `clearance` m from their sides; `height` is appended."""
+    half = max(arena.cell / 2 - clearance, 0.0)
+    found = [tuple(map(float, centre)) for centre in arena.centres(symbols)]
+    return Places(
+        tuple((x - half, y - half, *height) for x, y in found), tuple((x + half, y + half, *height) for x, y in found)
     )
-    return ant.Ant(Physics(model, engine=resolve_engine(engine), frames=chosen["frames"]))
+
+
+def plane(arena: Arena) -> Geometry:
+    """Goals and regions over x and y: the box around the free cells, cut in the middle of both."""
+    free = arena.free()
+    (x_lo, y_lo), (x_hi, y_hi) = free[:, :2].min(0).tolist(), free[:, 2:].max(0).tolist()
+    reach = max(1.25 * arena.cell, 5.0)
+    return Geometry(
+        goal_indices=(0, 1),
+        abstract_indices=(0, 1),
+        space=((x_lo, y_lo), (x_hi, y_hi)),
+        region_cuts=(((x_lo + x_hi) / 2,), ((y_lo + y_hi) / 2,)),
+        subgoal_scale=(reach, reach),
+    )
+
+
+def maze(body: str, arena: Arena, **columns: Any) -> Task:
+    """A row over x and y. Unless `columns` says otherwise: goals and success as on a map of the user's own.
+
+    Training goals lie anywhere in the free cells. Test goals are the cells marked `g`, else the free cell that is
+    the longest walk away. Success is within 5/8 of a cell.
+    """
+    anywhere = around(arena, FREE + ROBOT + GOAL, clearance=CLEARANCE[body])
+    marked = GOAL if any(arena.cells(GOAL)) else None
+    goals = {"train": anywhere, "test": centres(arena, GOAL) if marked else point(*arenas.farthest(arena))}
+    row = {
+        "geometry": plane(arena),
+        "success_radius": 0.625 * arena.cell,
+        "goals": goals,
+        "starts": {"task": centres(arena, ROBOT)},
+    } | columns
+    row["goals"] = {**row["goals"], "free": anywhere}
+    row["starts"] = {**row["starts"], "free": anywhere}
+    return Task(body=body, arena=arena, **row)
+
+
+def own(body: str, source: str, *, cell: float) -> Task:
+    """The row of a map of the user's own; raises `EnvError` if the map is malformed."""
+    return maze(body, arenas.read(source, cell=cell), maps=True)
+
+
+# The published tasks (star.md of the paper's experiments): 8 m cells, success within 5 m.
+
+MAZE = Arena(rows=("11111", "1r001", "11101", "10001", "11111"), cell=8.0)
+CAM = Arena(rows=("11111", "1r001", "111D1", "10001", "11111"), cell=8.0)
+PUSH = Arena(rows=("11111", "10r11", "10B01", "11011", "11111"), cell=8.0, block="xy")
+FALL = Arena(rows=("1111", "1r01", "10B1", "1##1", "1001", "1111"), cell=8.0, block="yz")
+STOCHASTIC = Arena(rows=("11111", "10r01", "10B01", "10001", "11111"), cell=8.0, block="x")
+SPARSE = Arena(
+    rows=(
+        "1111111111",
+        "1rrrrrrrr1",
+        "1rrrrrrrr1",
+        "1111111rr1",
+        "10rrrrrrr1",
+        "10rrrrrrr1",
+        "1111111rr1",
+        "1rrrrrrrr1",
+        "1rrrrrrrr1",
+        "1111111111",
+    ),
+    cell=2.0,
+)
+MAZE_GOALS = {"train": box((-4.0, -4.0), (20.0, 20.0)), "test": point(0.0, 16.0)}
+CAM_SWITCH = Switch(lower=(16.0, float("-inf")), upper=(20.0, 8.0), yaw=(-1.0, 0.0))
+
+# Goals on the far side of the chasm, seen in x, y and z: the third abstract dimension tells the chasm's bottom.
+FALL_GOALS = {"train": point(0.0, 27.0, 4.5), "test": point(0.0, 27.0, 4.5)}
+FALL_GEOMETRY = Geometry(
+    goal_indices=(0, 1, 2),
+    abstract_indices=(0, 1, 2),
+    space=((-4.0, -4.0, 0.0), (12.0, 28.0, 8.0)),
+    region_cuts=((4.0,), (12.0,), ()),
+    subgoal_scale=(10.0, 10.0, 0.5),
+)
+
+# The reference names rooms of 4 m cells without showing them. These are ours.
+
+ROOMS_2 = Arena(rows=("111111111", "100010001", "1r0000001", "100010001", "111111111"), cell=4.0)
+ROOMS_3 = Arena(rows=("1111111111111", "1r00100000001", "1000100010001", "10000000100g1", "1111111111111"), cell=4.0)
+ROOMS_4 = Arena(
+    rows=(
+        "111111111",
+        "1r0010001",
+        "100000001",
+        "100010001",
+        "110111011",
+        "100010001",
+        "100000001",
+        "1000100g1",
+        "111111111",
+    ),
+    cell=4.0,
+)
+
+
+def _transposed(*rows: str) -> tuple[str, ...]:
+    return tuple("".join(column) for column in zip(*rows, strict=True))
+
+
+# JaxGCRL's mazes, whose first index is x: 4 m cells, success within .5 m, goals at the centres of the cells `g`.
+
+U_MAZE = Arena(_transposed("11111", "1rgg1", "111g1", "1ggg1", "11111"), cell=4.0)
+U_MAZE_TEST = Arena(_transposed("11111", "1r001", "11101", "1ggg1", "11111"), cell=4.0)
+BIG_MAZE = Arena(
+    _transposed("11111111", "1rg11gg1", "1gg1ggg1", "11ggg111", "1gg1ggg1", "1g1gg1g1", "1ggg1gg1", "11111111"),
+    cell=4.0,
+)
+BIG_MAZE_TEST = Arena(
+    _transposed("11111111", "1r011gg1", "10010gg1", "11000111", "10010001", "101g01g1", "10gg1gg1", "11111111"),
+    cell=4.0,
+)
+HARDEST_MAZE = Arena(
+    _transposed(
+        "111111111111",
+        "1rggg1ggggg1",
+        "1g11g1g1g1g1",
+        "1gggggg1ggg1",
+        "1g1111g111g1",
+        "1gg1g1ggggg1",
+        "11g1g1g1g111",
+        "1gg1ggg1ggg1",
+        "111111111111",
+    ),
+    cell=4.0,
+)
+
+
+def _jaxgcrl(body: str, arena: Arena, test: Arena) -> Task:
+    goals = {"train": centres(arena, GOAL), "test": centres(test, GOAL)}
+    return maze(body, arena, success_radius=0.5, goals=goals, defaults={"reward": "sparse"})
+
+
+def _both(body: str) -> dict[str, Task]:
+    """The tasks that make sense for any body."""
+    sparse = {"train": point(2.0, 9.0), "test": point(2.0, 9.0)}
+    return {
+        f"{body}_maze": maze(body, MAZE, goals=MAZE_GOALS, maps=True),
+        f"{body}_maze_cam": maze(body, CAM, goals=MAZE_GOALS, switch=CAM_SWITCH),
+        f"{body}_maze_sparse": maze(body, SPARSE, success_radius=1.0, goals=sparse, defaults={"reward": "sparse"}),
+        f"{body}_2rooms": maze(body, ROOMS_2),
+        f"{body}_3rooms": maze(body, ROOMS_3),
+        f"{body}_4rooms": maze(body, ROOMS_4),
+        f"{body}_u_maze": _jaxgcrl(body, U_MAZE, U_MAZE_TEST),
+        f"{body}_big_maze": _jaxgcrl(body, BIG_MAZE, BIG_MAZE_TEST),
+        f"{body}_hardest_maze": _jaxgcrl(body, HARDEST_MAZE, HARDEST_MAZE),
+    }
+
+
+def _fall() -> Task:
+    free = around(FALL, FREE + ROBOT, clearance=CLEARANCE["ant"], height=(4.5,))
+    row = maze("ant", FALL, geometry=FALL_GEOMETRY, goals=FALL_GOALS)
+    return replace(row, goals={**FALL_GOALS, "free": free})
 
 
 TASKS: Mapping[str, Task] = {
-    "point_maze": Task(
-        arena=MAZE,
-        geometry=MAZE_GEOMETRY,
-        goals=MAZE_GOALS,
-        build=_point,
-        engines=("auto", "jax"),
-        options={"episode_length": count(500)},
-    ),
-    "ant_maze": Task(
-        arena=MAZE,
-        geometry=MAZE_GEOMETRY,
-        goals=MAZE_GOALS,
-        build=_ant,
-        engines=engines(),
-        options=ANT_OPTIONS,
+    **_both("point"),
+    **_both("ant"),
+    "ant_push": maze("ant", PUSH, goals={"train": point(0.0, 19.0), "test": point(0.0, 19.0)}),
+    "ant_fall": _fall(),
+    "ant_maze_stochastic": maze(
+        "ant", STOCHASTIC, goals={"train": box((-12.0, -4.0), (12.0, 20.0)), "test": point(0.0, 16.0)}, block_noise=1.0
     ),
 }
 
 
 def names() -> tuple[str, ...]:
-    """The names that `make` knows."""
+    """The names that `envs.make` knows."""
     return tuple(TASKS)
-
-
-def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
-    """Build a task.
-
-    Args:
-      name: one of `names()`.
-      engine: the physics engine; `auto` takes the fastest one that this machine has.
-      **options: options of the task, see docs/environments.md.
-
-    Raises:
-      EnvError: in one line, if a name or value is unknown, or the engine cannot run here.
-    """
-    if name not in TASKS:
-        raise EnvError(f'task "{name}" is unknown; {known(name, TASKS)}')
-    task = TASKS[name]
-    if engine not in task.engines:
-        raise EnvError(f'engine "{engine}" is not one of {name}; {known(engine, task.engines)}')
-    chosen = resolve(name, {"goals": choice(*task.goals), **task.options}, options)
-    return MazeEnv(
-        name,
-        task.arena,
-        task.build(task.arena, engine, chosen),
-        task.goals[chosen["goals"]],
-        task.geometry,
-        episode_length=chosen["episode_length"],
-    )

@@ -15,8 +15,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
 
+from envs._quiet import Env, State
 from envs.batching import flattened
 
 

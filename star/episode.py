@@ -9,14 +9,16 @@ Clocks restart with every episode. Environments that end early wait until the se
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State as EnvState
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from envs._quiet import State as EnvState
 from envs.vector import VectorEnv
 from star import abstraction as regions
 from star import commander, controller, learner, tutor
@@ -55,8 +57,17 @@ class Episode(struct.PyTreeNode):
         return cls(*(jnp.zeros(num_envs) for _ in range(4)))
 
 
+Record = Callable[[EnvState, Array, Box], Any]
+"""What to keep of an env step, given the B environments before it, their subgoals [B, d] and their target boxes."""
+
+
 class Steps(struct.PyTreeNode):
-    """One segment step by step, leading axes [l, B]. `alive` is 1 until the environment has ended."""
+    """One segment step by step, leading axes [l, B]. `alive` is 1 until the environment has ended.
+
+    `ended` is 1 where an episode ends before its time, `terminated` where nothing is to be bootstrapped either.
+    `non_finite` and `overflow` are 1 where that is because the simulator failed. `recorded` is what the `Record`
+    given to `rollout` kept.
+    """
 
     obs: Float[Array, "l B obs"]
     next_obs: Float[Array, "l B obs"]
@@ -65,24 +76,41 @@ class Steps(struct.PyTreeNode):
     action: Float[Array, "l B act"]
     reward: Float[Array, "l B"]
     terminated: Float[Array, "l B"]
+    ended: Float[Array, "l B"]
     alive: Float[Array, "l B"]
+    non_finite: Float[Array, "l B"]
+    overflow: Float[Array, "l B"]
+    recorded: Any = None
 
 
 def evaluate(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, *, key: Array) -> Episode:
-    """One greedy episode of every environment of `env`; nothing is learnt."""
+    """The statistics of one greedy episode of every environment of `env`; nothing is learnt."""
+    return play(config, spec, env, state, key=key)[0].episode
+
+
+def play(
+    config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, *, record: Record | None = None, key: Array
+) -> tuple[Streams, Any]:
+    """One greedy episode of every environment of `env`: the streams at its end, and what `record` kept.
+
+    The latter has the leading axis [T] of all env steps of the episode; it is None without `record`.
+    """
     reset_key, scan_key = jax.random.split(key)
     streams = start(spec, env, state.abstraction, key=reset_key)
     allowed = successors(config, state)
 
-    def segment(streams: Streams, key: Array) -> tuple[Streams, None]:
+    def segment(streams: Streams, key: Array) -> tuple[Streams, Any]:
         command_key, tutor_key, rollout_key = jax.random.split(key, 3)
         streams = command(config, spec, state, allowed, streams, epsilon=0.0, key=command_key)
         subgoal, _ = choose_subgoal(config, spec, state, streams, deterministic=True, key=tutor_key)
-        streams, steps = rollout(config, spec, env, state, streams, subgoal, deterministic=True, key=rollout_key)
-        return advance(config, streams), None
+        streams, steps = rollout(
+            config, spec, env, state, streams, subgoal, deterministic=True, record=record, key=rollout_key
+        )
+        return advance(config, streams), steps.recorded
 
     segments = spec.episode_length // config.tutor.period
-    return jax.lax.scan(segment, streams, jax.random.split(scan_key, segments))[0].episode
+    streams, recorded = jax.lax.scan(segment, streams, jax.random.split(scan_key, segments))
+    return streams, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), recorded)
 
 
 def start(spec: Spec, env: VectorEnv, abstraction: Abstraction, *, key: Array) -> Streams:
@@ -177,6 +205,7 @@ def rollout(
     subgoal: Float[Array, "B d"],
     *,
     deterministic: bool,
+    record: Record | None = None,
     key: Array,
 ) -> tuple[Streams, Steps]:
     """L env steps under one subgoal per environment. Environments that end stay as they are in the statistics."""
@@ -184,6 +213,7 @@ def rollout(
     def step(carry: tuple[EnvState, Array, Array, Episode], step_key: Array) -> tuple[tuple, Steps]:
         env_state, subgoal, alive, episode = carry
         obs = env_state.obs
+        recorded = record(env_state, subgoal, streams.box) if record else None
         seen = controller.observe(spec.state(obs), subgoal, position=spec.abstract_indices)
         action = learner.act(config.controller, state.controller, seen, deterministic=deterministic, key=step_key)
         env_state = env.step(env_state, action)
@@ -196,11 +226,15 @@ def rollout(
             action=action,
             reward=env_state.reward,
             terminated=env_state.done * (1 - env_state.info["truncation"]),
+            ended=env_state.done * (env_state.info["steps"] < spec.episode_length),
             alive=alive,
+            non_finite=env_state.metrics["non_finite"],
+            overflow=env_state.metrics["overflow"],
+            recorded=recorded,
         )
         return (env_state, after, alive * (1 - env_state.done), _record(episode, env_state, alive)), steps
 
-    carry = (streams.env, subgoal, jnp.ones(env.num_envs), streams.episode)
+    carry = (streams.env, subgoal, 1 - streams.env.done, streams.episode)
     (env_state, _, _, episode), steps = jax.lax.scan(step, carry, jax.random.split(key, config.tutor.period))
     reward = commander.accumulate(config.commander, streams.reward, steps.reward, steps.alive)
     return streams.replace(env=env_state, episode=episode, reward=reward), steps
@@ -212,8 +246,8 @@ def advance(config: AgentConfig, streams: Streams) -> Streams:
 
 
 def restart_ended(env: VectorEnv, streams: Streams, steps: Steps, *, key: Array) -> Streams:
-    """Reset the environments that terminated in this segment, with clocks and statistics at their start."""
-    ended = jnp.max(steps.terminated * steps.alive, axis=0) > 0
+    """Reset the environments that ended early in this segment, with clocks and statistics at their start."""
+    ended = jnp.max(steps.ended * steps.alive, axis=0) > 0
     env_state = env.reset_where(streams.env, ended, key)
     restarted = streams.replace(clock=jnp.zeros_like(streams.clock), episode=Episode.start(env.num_envs), env=env_state)
     return _select(ended, restarted, streams.replace(env=env_state))

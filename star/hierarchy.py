@@ -40,10 +40,11 @@ def epoch(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState) ->
     key, reset_key, scan_key, end_key = jax.random.split(state.key, 4)
     streams = episode.start(spec, env, state.abstraction, key=reset_key)
     blocks = spec.episode_length // (config.tutor.period * config.tutor.unroll)
-    (state, streams), (outcomes, metrics) = jax.lax.scan(
+    (state, streams), (outcomes, metrics, counts) = jax.lax.scan(
         partial(_block, config, spec, env), (state.replace(key=key), streams), jax.random.split(scan_key, blocks)
     )
-    metrics = jax.tree.map(jnp.mean, metrics) | _episode_metrics("train", streams.episode)
+    metrics = jax.tree.map(jnp.mean, metrics) | jax.tree.map(jnp.sum, counts)
+    metrics |= _episode_metrics("train", streams.episode)
     outcomes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), outcomes)
     state, more = _learn_between_episodes(config, spec, state, outcomes, env.num_envs, key=end_key)
     metrics |= more | {"commander/epsilon": commander.epsilon(config.commander, _env_steps(spec, env, state))}
@@ -52,22 +53,22 @@ def epoch(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState) ->
 
 def _block(
     config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], key: Array
-) -> tuple[tuple[TrainState, Streams], tuple[Any, Metrics]]:
+) -> tuple[tuple[TrainState, Streams], tuple[Any, Metrics, Metrics]]:
     """`tutor.unroll` segments, then one update of the Tutor."""
     scan_key, update_key, relabel_key = jax.random.split(key, 3)
-    carry, (decisions, outcomes, metrics) = jax.lax.scan(
+    carry, (decisions, outcomes, metrics, counts) = jax.lax.scan(
         partial(_segment, config, spec, env), carry, jax.random.split(scan_key, config.tutor.unroll)
     )
     state, streams = carry
     relabel = _relabel(config, spec, state) if config.tutor.off_policy_correction else None
     tutor_state, tutor_metrics = learner.update(config.tutor, state.tutor, decisions, relabel=relabel, key=update_key)
     metrics = jax.tree.map(jnp.mean, metrics) | _prefix("tutor", tutor_metrics)
-    return (state.replace(tutor=tutor_state), streams), (outcomes, metrics)
+    return (state.replace(tutor=tutor_state), streams), (outcomes, metrics, counts)
 
 
 def _segment(
     config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], key: Array
-) -> tuple[tuple[TrainState, Streams], tuple[Transition, Any, Metrics]]:
+) -> tuple[tuple[TrainState, Streams], tuple[Transition, Any, Metrics, Metrics]]:
     """One decision of the Tutor: command, act, roll out, let Controller and Commander learn."""
     state, streams = carry
     command_key, tutor_key, rollout_key, update_key, reset_key = jax.random.split(key, 5)
@@ -94,11 +95,18 @@ def _segment(
         "controller", controller_metrics | {"reward": _weighted(experience.reward, experience.weight)}
     ) | {
         "tutor/reward": transition.reward.mean(),
-        "env/terminated": (steps.terminated * steps.alive).mean(),
+    }
+    counts = {
+        f"env/{name}": (value * steps.alive).sum()
+        for name, value in (
+            ("terminated", steps.terminated),
+            ("non_finite", steps.non_finite),
+            ("overflow", steps.overflow),
+        )
     }
     streams = episode.restart_ended(env, streams, steps, key=reset_key)
     state = state.replace(controller=controller_state, commander=commander_state)
-    return (state, streams), (transition, (decision, outcome), metrics)
+    return (state, streams), (transition, (decision, outcome), metrics, counts)
 
 
 def _learn_between_episodes(
@@ -153,7 +161,7 @@ def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transi
         reward=controller.reward(config.controller, steps.subgoal, steps.next_subgoal),
         next_obs=observe(spec.state(steps.next_obs), steps.next_subgoal),
         terminated=steps.terminated,
-        cut=jnp.maximum(last, steps.terminated),
+        cut=jnp.maximum(last, steps.ended),
         weight=steps.alive,
     )
 
@@ -166,7 +174,7 @@ def _tutor_transition(
     path = jnp.concatenate([began[None], steps.next_obs])
     achieved = spec.abstract(path)
     distances = jnp.linalg.norm(achieved - streams.box.centre, axis=-1)
-    terminated = jnp.max(steps.terminated * steps.alive, axis=0)
+    terminated, ended = (jnp.max(flag * steps.alive, axis=0) for flag in (steps.terminated, steps.ended))
     extras: Any = ()
     if config.tutor.off_policy_correction:
         swap = partial(jnp.swapaxes, axis1=0, axis2=1)
@@ -178,7 +186,7 @@ def _tutor_transition(
         reward=tutor.reward(config.tutor, distances, steps.alive),
         next_obs=observe(spec.state(end), spec.abstract(end), streams.box),
         terminated=terminated,
-        cut=jnp.maximum(streams.clock == 0, terminated),
+        cut=jnp.maximum(streams.clock == 0, ended),
         weight=jnp.ones_like(terminated),
         extras=extras,
     )
@@ -189,7 +197,7 @@ def _finished_period(
 ) -> tuple[Decision, Outcome]:
     """The Commander's decisions that came to their end with this segment; weight 0 elsewhere."""
     end = spec.abstract(steps.next_obs[-1])
-    whole_segment = steps.alive[-1] * (1 - steps.terminated[-1])
+    whole_segment = steps.alive[-1] * (1 - steps.ended[-1])
     weight = jnp.where(streams.clock == 0, whole_segment, 0.0)
     decision = Decision(
         region=streams.region,

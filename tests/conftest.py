@@ -15,7 +15,7 @@ from hypothesis import settings  # noqa: E402
 import envs  # noqa: E402
 import star.state  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
-from envs.tasks import MAZE_GEOMETRY, MAZE_GOALS  # noqa: E402
+from envs.tasks import TASKS  # noqa: E402
 from star import config, episode, hierarchy  # noqa: E402
 
 settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
@@ -37,27 +37,34 @@ TINY = {
 
 
 class Fused:
-    """A body that breaks (turns NaN, which ends the episode early) after 2, 4 or 6 steps in half of all episodes.
+    """A body that flips (which terminates) or breaks (turns NaN, which truncates) early in most episodes.
 
-    With l = 3 and k = 6, that is within the first segment, within the second, and at the very end of a period.
+    With l = 3 and k = 6, 2, 4 and 6 steps are within the first segment, within the second, and at the very end of a
+    period. A negative fuse flips, a positive one breaks.
     """
 
     def __init__(self, body):
         self._body = body
         self.state_dim, self.action_size, self.dt, self.engine = body.state_dim, body.action_size, body.dt, body.engine
 
-    def init(self, rng):
-        fuses = jnp.array([2.0, 4.0, 6.0, 1e6, 1e6, 1e6])
-        return self._body.init(rng), jax.random.choice(jax.random.fold_in(rng, 1), fuses)
+    def init(self, rng, position):
+        fuses = jnp.array([2.0, 6.0, -2.0, -4.0, -6.0, 1e6, 1e6, 1e6])
+        return self._body.init(rng, position), jax.random.choice(jax.random.fold_in(rng, 1), fuses)
 
     def step(self, data, action):
         point, fuse = data
         point = self._body.step(point, action)
-        broken = jnp.where(fuse <= 1, jnp.nan, point.position)
-        return point.replace(position=broken), fuse - 1
+        fuse -= jnp.sign(fuse)
+        return point.replace(position=jnp.where((fuse == 0) & (data[1] > 0), jnp.nan, point.position)), fuse
 
     def observe(self, data, steps):
         return self._body.observe(data[0], steps)
+
+    def flipped(self, data):
+        return data[1] == 0
+
+    def dropped(self, data):
+        return jnp.zeros((), bool)
 
 
 @pytest.fixture(scope="session")
@@ -68,10 +75,17 @@ def tiny():
 
 @pytest.fixture(scope="session")
 def breaking_env():
-    """Point Maze whose episodes end early, without truncation, in about half of all cases."""
-    plain = envs.make("point_maze")
+    """Point Maze whose episodes end early in more than half of all cases, some terminated, some truncated."""
     env = MazeEnv(
-        "breaking", plain.arena, Fused(plain.body), MAZE_GOALS["train"], MAZE_GEOMETRY, episode_length=EPISODE
+        "breaking",
+        TASKS["point_maze"],
+        Fused(envs.make("point_maze").body),
+        goals="train",
+        start="task",
+        episode_length=EPISODE,
+        reward="distance",
+        success_radius=5.0,
+        flip="terminate",
     )
     return envs.VectorEnv(env, NUM_ENVS, auto_reset=False)
 

@@ -17,8 +17,8 @@ def streams_and_segments(recording):
 
 
 def ended(recording, i, b):
-    """Whether environment b terminated in segment i."""
-    return any(recording.steps.terminated[i, t, b] * recording.steps.alive[i, t, b] for t in range(L))
+    """Whether environment b ended early in segment i."""
+    return any(recording.steps.ended[i, t, b] * recording.steps.alive[i, t, b] for t in range(L))
 
 
 def slow_locate(abstraction, point):
@@ -31,8 +31,9 @@ def slow_locate(abstraction, point):
 def test_the_recording_shows_everything_that_the_tests_below_are_about(recording):
     ends = [ended(recording, i, b) for i, b in streams_and_segments(recording)]
     assert any(ends) and not all(ends)
-    over = recording.steps.terminated * recording.steps.alive  # ends in either segment and at the end of a period
+    over = recording.steps.ended * recording.steps.alive  # ends in either segment and at the end of a period
     assert over[:, 1].any() and over[:, 0].any() and over[:, 2].any()
+    assert (over * recording.steps.terminated).any() and (over * recording.steps.non_finite).any()
     assert len(np.unique(recording.decision.region)) > 2
     at_goal = recording.commanded.target == recording.commanded.goal_region
     assert at_goal.any() and not at_goal.all()
@@ -129,7 +130,7 @@ def test_an_environment_that_ended_waits_for_the_end_of_the_segment(recording):
         alive = 1.0
         for t in range(L):
             assert recording.steps.alive[i, t, b] == alive
-            if recording.steps.terminated[i, t, b]:
+            if recording.steps.ended[i, t, b]:
                 alive = 0.0
             elif not alive:
                 pytest.fail("an ended environment went on without a reset")

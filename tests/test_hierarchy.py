@@ -17,7 +17,7 @@ def segments(recording):
 
 
 def ended(recording, i, b):
-    return (recording.steps.terminated[i, :, b] * recording.steps.alive[i, :, b]).any()
+    return (recording.steps.ended[i, :, b] * recording.steps.alive[i, :, b]).any()
 
 
 def finished(recording, i, b):
@@ -79,9 +79,8 @@ def test_the_controller_sees_no_position_but_the_subgoal_before_and_after_the_st
 def test_the_controllers_chain_is_cut_where_the_subgoal_or_the_episode_ends(recording):
     for i, b in segments(recording):
         for t in range(L):
-            terminated = recording.steps.terminated[i, t, b]
-            assert recording.controller.terminated[i, t, b] == terminated
-            assert recording.controller.cut[i, t, b] == (t == L - 1 or terminated)
+            assert recording.controller.terminated[i, t, b] == recording.steps.terminated[i, t, b]
+            assert recording.controller.cut[i, t, b] == (t == L - 1 or recording.steps.ended[i, t, b])
             assert recording.controller.weight[i, t, b] == recording.steps.alive[i, t, b]
 
 
@@ -112,7 +111,8 @@ def test_the_tutor_sees_the_state_and_the_bounds_of_its_box_but_never_the_goal(r
 
 def test_the_tutors_chain_is_cut_where_the_target_or_the_episode_ends(recording):
     for i, b in segments(recording):
-        assert recording.tutor.terminated[i, b] == ended(recording, i, b)
+        terminated = (recording.steps.terminated[i, :, b] * recording.steps.alive[i, :, b]).any()
+        assert recording.tutor.terminated[i, b] == terminated
         assert recording.tutor.cut[i, b] == (recording.before.clock[i, b] == K - L or ended(recording, i, b))
     assert (recording.tutor.weight == 1).all()
 

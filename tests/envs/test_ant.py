@@ -49,7 +49,7 @@ def test_each_action_pushes_its_own_joint_with_thirty_newton_metres(env):
 
 def solver_options(**options):
     body: Any = envs.make("ant_maze", engine="native", **options).body
-    return body.model.opt
+    return body.physics.model.opt
 
 
 def test_presets_and_options_reach_the_model():

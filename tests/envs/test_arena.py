@@ -5,9 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envs import ant
-from envs.arena import Arena, build_model
+from envs.arena import Arena
+from envs.scene import build_model
 
-MAZE = Arena(rows=("11111", "1r001", "11101", "10001", "11111"), cell=8.0, wall_height=4.0)
+MAZE = Arena(rows=("11111", "1r001", "11101", "10001", "11111"), cell=8.0)
 
 
 @st.composite
@@ -16,7 +17,7 @@ def arenas(draw):
     cells = draw(st.lists(st.sampled_from("01"), min_size=height * width, max_size=height * width))
     cells[draw(st.integers(0, height * width - 1))] = "r"
     rows = tuple("".join(cells[r * width : (r + 1) * width]) for r in range(height))
-    return Arena(rows=rows, cell=draw(st.sampled_from([1.0, 4.0, 8.0])), wall_height=1.0)
+    return Arena(rows=rows, cell=draw(st.sampled_from([1.0, 4.0, 8.0])))
 
 
 def cell_centres(arena, wanted):
@@ -55,7 +56,7 @@ def test_middle_wall_closes_the_left_and_leaves_the_right_open():
 
 
 def test_model_has_one_box_for_each_merged_wall():
-    model = build_model(MAZE, ant.xml(), {})
+    model = build_model(MAZE, ant.spec(), {})
     boxes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
     centres, halves = model.geom_pos[boxes], model.geom_size[boxes]
     np.testing.assert_allclose(np.hstack([(centres - halves)[:, :2], (centres + halves)[:, :2]]), MAZE.walls())
@@ -64,7 +65,7 @@ def test_model_has_one_box_for_each_merged_wall():
 
 
 def test_every_ant_geom_meets_floor_and_walls_and_no_other_pair_meets():
-    model = build_model(MAZE, ant.xml(), {})
+    model = build_model(MAZE, ant.spec(), {})
     moves = model.body_weldid[model.geom_bodyid] != 0
     meets = (model.geom_contype[:, None] & model.geom_conaffinity[None, :]) != 0
     np.testing.assert_array_equal(meets | meets.T, moves[:, None] ^ moves[None, :])
@@ -73,4 +74,4 @@ def test_every_ant_geom_meets_floor_and_walls_and_no_other_pair_meets():
 
 @pytest.mark.parametrize(("name", "value"), [("timestep", 0.01), ("iterations", 7)])
 def test_options_reach_the_model(name, value):
-    assert getattr(build_model(MAZE, ant.xml(), {name: value}).opt, name) == value
+    assert getattr(build_model(MAZE, ant.spec(), {name: value}).opt, name) == value

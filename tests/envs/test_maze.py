@@ -86,19 +86,19 @@ def test_the_time_limit_truncates_and_does_not_terminate(env):
     assert told == [(1, 0.0, 0.0), (2, 0.0, 0.0), (3, 1.0, 1.0)]
 
 
-def test_a_simulation_that_breaks_terminates_with_finite_outputs(env):
+def test_a_simulation_that_breaks_is_truncated_with_finite_outputs(env):
     state, step = reset(env), jax.jit(env.step)
     for _ in range(4):
         after = step(with_nan_velocity(state), idle(env))
-        assert (float(after.done), float(after.info["truncation"])) == (1.0, 0.0)
+        assert (float(after.done), float(after.info["truncation"])) == (1.0, 1.0)
         np.testing.assert_array_equal(after.obs, state.obs)
         assert np.isfinite(after.reward) and all(np.isfinite(value) for value in after.metrics.values())
         state = after
 
 
-def test_an_action_that_is_not_a_number_terminates(env):
+def test_an_action_that_is_not_a_number_ends_the_episode(env):
     after = jax.jit(env.step)(reset(env), idle(env).at[0].set(jnp.nan))
-    assert (float(after.done), float(after.info["truncation"])) == (1.0, 0.0)
+    assert (float(after.done), float(after.metrics["non_finite"])) == (1.0, 1.0)
     assert np.isfinite(after.obs).all()
 
 

@@ -4,11 +4,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.arena import Arena
 from envs.point import MAX_SPEED, RADIUS, Point, PointState
+from envs.tasks import TASKS
 
-WALLS = Arena(rows=("11111", "1r001", "11101", "10001", "11111"), cell=8.0, wall_height=4.0).walls()
-POINT = Point(WALLS)
+WALLS = TASKS["point_maze"].arena.walls()
+POINT = Point(TASKS["point_maze"])
 STEPS = 50
 
 
@@ -20,7 +20,7 @@ def positions(start, velocity, actions):
         data = jax.vmap(POINT.step)(data, action)
         return data, data.position
 
-    return jax.lax.scan(step, PointState(position=start, velocity=velocity), actions)[1]
+    return jax.lax.scan(step, PointState(position=start, velocity=velocity, open=jnp.zeros(len(start))), actions)[1]
 
 
 def touches(position):
@@ -52,21 +52,21 @@ def test_point_never_enters_a_wall_nor_crosses_one(seed, speed):
 
 
 def test_point_slides_along_a_wall_it_pushes_against():
-    data = PointState(position=jnp.array([0.0, 3.5]), velocity=jnp.array([0.0, 0.0]))
+    data = PointState(position=jnp.array([0.0, 3.5]), velocity=jnp.array([0.0, 0.0]), open=jnp.zeros(()))
     after = POINT.step(data, jnp.array([1.0, 1.0]))
     np.testing.assert_allclose(after.position, [0.12, 3.5], atol=1e-6)
     np.testing.assert_allclose(after.velocity, [1.2, 0.0], atol=1e-6)
 
 
 def test_point_reaches_and_keeps_its_commanded_velocity():
-    data = PointState(position=jnp.array([0.0, 0.0]), velocity=jnp.array([0.0, 0.0]))
+    data = PointState(position=jnp.array([0.0, 0.0]), velocity=jnp.array([0.0, 0.0]), open=jnp.zeros(()))
     for _ in range(30):
         data = POINT.step(data, jnp.array([0.5, 0.0]))
     np.testing.assert_allclose(data.velocity, [0.5 * MAX_SPEED, 0.0], atol=1e-3)
 
 
 def test_starts_are_scattered_around_the_origin():
-    data = jax.vmap(POINT.init)(jax.random.split(jax.random.key(0), 2000))
+    data = jax.vmap(POINT.init, in_axes=(0, None))(jax.random.split(jax.random.key(0), 2000), jnp.zeros(2))
     assert np.abs(data.position).max() <= 0.1
     np.testing.assert_allclose(np.std(data.position, axis=0), 0.2 / np.sqrt(12), rtol=0.1)
     np.testing.assert_allclose(np.std(data.velocity, axis=0), 0.1, rtol=0.1)

@@ -1,0 +1,52 @@
+"""`make`: from a row of the registry and options to an environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from envs import ant, point, tasks
+from envs.maze import Body, MazeEnv
+from envs.options import EnvError, known, resolve
+from envs.tasks import TASKS, Task
+
+BODIES: Mapping[str, Callable[[Task, str, Mapping[str, Any]], Body]] = {"ant": ant.build, "point": point.build}
+
+
+def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
+    """Build a task.
+
+    Args:
+      name: one of `names()`.
+      engine: the physics engine; `auto` takes the fastest one that this machine has.
+      **options: options of the task, see docs/environments.md.
+
+    Raises:
+      EnvError: in one line, if a name, value or map is wrong, or the engine cannot run here.
+    """
+    if name not in TASKS:
+        raise EnvError(f'task "{name}" is unknown; {known(name, TASKS)}')
+    task = TASKS[name]
+    if engine not in task.engines:
+        raise EnvError(f'engine "{engine}" is not one of {name}; {known(engine, task.engines)}')
+    chosen = resolve(name, task.options(), options)
+    if chosen.get("map") is not None:
+        task = tasks.own(task.body, chosen["map"], cell=task.arena.cell)
+        for key, sets in (("goals", task.goals), ("start", task.starts)):
+            if chosen[key] not in sets:
+                raise EnvError(f'option "{key}" of a map is {chosen[key]!r}; allowed: {", ".join(sets)}')
+    if chosen["cell"] is not None:
+        task = task.resized(chosen["cell"])
+    radius = chosen["success_radius"]
+    return MazeEnv(
+        name,
+        task,
+        BODIES[task.body](task, engine, chosen),
+        goals=chosen["goals"],
+        start=chosen["start"],
+        episode_length=chosen["episode_length"],
+        reward=chosen["reward"],
+        success_radius=task.success_radius if radius is None else radius,
+        flip=chosen.get("flip", "ignore"),
+        position_noise=chosen["position_noise"],
+    )

@@ -1,0 +1,130 @@
+"""The MuJoCo model of a body in an arena.
+
+    floor   a plane at z = 0, and boxes under the cells that have a floor if some have none
+    walls   one box for each merged rectangle
+    block   a body on slide joints: light, 1 % smaller than its cell, with stiff contacts (BLOCK_SOLIMP)
+    gate    a mocap body, lifted out of the way by whoever steps the model
+
+Geoms that stand still have contype 0 and conaffinity 1, so that they never meet each other, and no margin of their
+own, so that contacts begin at the body's margin: MuJoCo adds the margins of two geoms. All take the other contact
+parameters of the body's default class.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from envs.arena import BLOCK, Arena
+
+FLOOR_COLOUR = (0.8, 0.8, 0.8, 1.0)
+WALL_COLOUR = (0.4, 0.5, 0.6, 1.0)
+BLOCK_COLOUR = (0.75, 0.35, 0.25, 1.0)
+GATE_COLOUR = (0.35, 0.55, 0.4, 1.0)
+BLOCK_SHRINK = 0.99  # side of a block over the side of its cell
+BLOCK_MASS = 0.001  # kg
+# The ant's soft contacts give way by .3 m under a bridge of 1 g, because MuJoCo scales stiffness with mass.
+BLOCK_SOLIMP = (0.99, 0.999, 0.001)
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+STATIC: dict[str, Any] = {"contype": 0, "conaffinity": 1, "margin": 0.0}
+
+
+def build_model(arena: Arena, body: mujoco.MjSpec, options: Mapping[str, Any], *, visual: bool = False) -> Any:
+    """The `MjModel` of `body` in `arena`. `options` are attributes of `MjSpec.option`.
+
+    The joints of `body` come first, then the slides of the blocks in the order of x, y, z. With `visual` the floor
+    has a checkered texture; the physics are the same.
+    """
+    for name, value in options.items():
+        setattr(body.option, name, value)
+    x_lo, y_lo, x_hi, y_hi = arena.bounds
+    middle, half = [(x_lo + x_hi) / 2, (y_lo + y_hi) / 2], [(x_hi - x_lo) / 2, (y_hi - y_lo) / 2]
+    world = body.worldbody
+    world.add_light(pos=[*middle, 40.0], dir=[0, 0, -1], type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL)
+    floor = world.add_geom(
+        name="floor",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        pos=[*middle, 0.0],
+        size=[*half, 0.1],
+        rgba=FLOOR_COLOUR,
+        **STATIC,
+    )
+    raised = arena.floors() if arena.floor_height else []
+    floors = [_box(world, f"floor_{i}", r, 0.0, arena.floor_height, FLOOR_COLOUR) for i, r in enumerate(raised)]
+    top = arena.floor_height + arena.wall_height
+    for i, rectangle in enumerate(arena.walls()):
+        _box(world, f"wall_{i}", rectangle, 0.0, top, WALL_COLOUR)
+    for i, centre in enumerate(arena.centres(BLOCK)):
+        _add_block(world, f"block_{i}", centre, arena)
+    for i, rectangle in enumerate(arena.gates()):
+        _add_gate(world, f"gate_{i}", rectangle, arena)
+    if visual:
+        _checker(body, [floor, *floors], cell=arena.cell)
+    return body.compile()
+
+
+def _box(parent: Any, name: str, rectangle: np.ndarray, low: float, high: float, colour: Any) -> Any:
+    return parent.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[*(rectangle[:2] + rectangle[2:]) / 2, (low + high) / 2],
+        size=[*(rectangle[2:] - rectangle[:2]) / 2, (high - low) / 2],
+        rgba=colour,
+        **STATIC,
+    )
+
+
+def _add_block(world: Any, name: str, centre: np.ndarray, arena: Arena) -> None:
+    half = arena.cell / 2
+    body = world.add_body(name=name, pos=[*centre, arena.floor_height + arena.wall_height / 2])
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[BLOCK_SHRINK * half, BLOCK_SHRINK * half, arena.wall_height / 2],
+        mass=BLOCK_MASS,
+        rgba=BLOCK_COLOUR,
+        contype=1,
+        conaffinity=1,
+        margin=0.0,
+        priority=1,
+        solimp=[*BLOCK_SOLIMP, 0.5, 2.0],
+    )
+    for axis in sorted(arena.block):
+        reach = [-arena.floor_height, 0.0] if axis == "z" else [-arena.cell, arena.cell]
+        body.add_joint(
+            name=f"{name}_{axis}",
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=AXES[axis],
+            armature=0.0,
+            damping=0.0,
+            limited=True,
+            range=reach,
+            margin=0.01,
+        )
+
+
+def _add_gate(world: Any, name: str, rectangle: np.ndarray, arena: Arena) -> None:
+    centre, half = (rectangle[:2] + rectangle[2:]) / 2, (rectangle[2:] - rectangle[:2]) / 2
+    height = arena.wall_height / 2
+    body = world.add_body(name=name, mocap=True, pos=[*centre, arena.floor_height + height])
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, height], rgba=GATE_COLOUR, **STATIC)
+
+
+def _checker(spec: mujoco.MjSpec, floors: list[Any], *, cell: float) -> None:
+    """Tiles of a quarter of a cell on the floor."""
+    spec.add_texture(
+        name="checker",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.85, 0.85, 0.85],
+        rgb2=[0.78, 0.78, 0.8],
+        width=256,
+        height=256,
+    )
+    material = spec.add_material(name="floor", texrepeat=[2 / cell, 2 / cell], texuniform=True)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "checker"
+    for floor in floors:
+        floor.material = "floor"
