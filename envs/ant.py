@@ -23,8 +23,8 @@ import mujoco
 import numpy as np
 
 from envs import scene
-from envs.arena import BLOCK
-from envs.physics import Physics, PhysicsState, resolve_engine
+from envs.arena import BLOCK, HEIGHT
+from envs.physics import Physics, PhysicsState
 from envs.tasks import PRESETS, Switch, Task
 
 MAX_TORQUE = 30.0  # N m
@@ -33,7 +33,7 @@ START_SPEED = 0.1  # standard deviation of the start qvel, m/s and rad/s
 STEP_SCALE = 0.001  # of the step count in the state
 QPOS, QVEL = 15, 14  # the ant's own positions and velocities; those of blocks follow
 ON_ITS_BACK = -0.5  # the ant is flipped when the vertical part of its own up axis is below
-LIFT = 2.0  # how far an open gate is lifted, in its own heights
+LIFT = 2 * HEIGHT  # how far an open gate is lifted, m
 
 INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
@@ -69,9 +69,7 @@ def build(task: Task, engine: str, options: Mapping[str, Any]) -> Ant:
         "ls_iterations": chosen["ls_iterations"],
     }
     body = spec(action_scale=chosen["action_scale"], collisions=chosen["collisions"])
-    physics = Physics(
-        scene.build_model(task.arena, body, solver), engine=resolve_engine(engine), frames=chosen["frames"]
-    )
+    physics = Physics(scene.build_model(task.arena, body, solver), engine=engine, frames=chosen["frames"])
     return Ant(physics, task, action_scale=chosen["action_scale"], full=chosen["observe"] == "full")
 
 
@@ -83,26 +81,29 @@ class Ant:
         self.physics = physics
         self.action_size = physics.model.nu
         self.dt = physics.dt
-        self.engine = physics.engine
         self._arena = task.arena
         self._switch: Switch | None = task.switch
         self._block_noise = task.block_noise
         self._full = full
         self._max_torque = MAX_TORQUE * action_scale
         self._closed = np.asarray(physics.mocap_pos)
-        self._lift = LIFT * task.arena.wall_height
         self._blocks = len(task.arena.centres(BLOCK))
         start = np.array(physics.model.qpos0)
         start[2] += task.arena.floor_height
-        self._start = jnp.asarray(start, jnp.float32)
+        self._start = start.astype(np.float32)
         slides = 2 * (len(start) - QPOS)
         self.state_dim = QPOS + QVEL + 1 + (slides + len(self._closed)) * full
+
+    @property
+    def engine(self) -> str:
+        """The engine of the physics."""
+        return self.physics.engine
 
     def init(self, rng: jax.Array, position: jax.Array) -> PhysicsState:
         """A noisy start at `position` [2]."""
         qpos_rng, qvel_rng, block_rng = jax.random.split(rng, 3)
         noise = jax.random.uniform(qpos_rng, (QPOS,), minval=-START_POSITION, maxval=START_POSITION)
-        qpos = self._start.at[:QPOS].add(noise).at[:2].add(position)
+        qpos = jnp.asarray(self._start).at[:QPOS].add(noise).at[:2].add(position)
         qpos = qpos.at[3:7].divide(jnp.linalg.norm(qpos[3:7]))
         if self._block_noise:
             first_x = QPOS + len(self._arena.block) * np.arange(self._blocks)
@@ -115,7 +116,7 @@ class Ant:
         data = self.physics.step(data, self._max_torque * action)
         if self._switch is None:
             return data
-        place = jnp.where(self._is_open(data) | self._at_switch(data), self._lift, 0.0)
+        place = jnp.where(self._is_open(data) | self._at_switch(data), LIFT, 0.0)
         return data.replace(mocap_pos=jnp.asarray(self._closed).at[:, 2].add(place))
 
     def observe(self, data: PhysicsState, steps: jax.Array) -> jax.Array:
@@ -147,7 +148,7 @@ class Ant:
 
     def _is_open(self, data: PhysicsState) -> jax.Array:
         """Whether each gate [n] is open."""
-        return data.mocap_pos[:, 2] > self._closed[:, 2] + self._lift / 2
+        return data.mocap_pos[:, 2] > self._closed[:, 2] + LIFT / 2
 
     def _at_switch(self, data: PhysicsState) -> jax.Array:
         assert self._switch is not None

@@ -6,7 +6,8 @@ A map has a row of characters for each row of cells:
     #  no floor        B  movable block    D  gate (door)
 
 The centre of the first robot's cell is the origin, +x runs right along a row, +y runs down the rows. Walls, blocks
-and gates are half a cell high. Where a map has cells without floor, the floor of all others is raised by as much.
+and gates are 4 m high whatever the size of the cells, so that no ant leaps over them. Where a map has cells without
+floor, the floor of all others is raised by as much.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from envs.options import EnvError
 
 WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE = "10rg#BD"
 SYMBOLS = (WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE)
-HEIGHT = 0.5  # of walls, blocks, gates and the raised floor, in cells
+HEIGHT = 4.0  # of walls, blocks, gates and the raised floor, in m
 MAX_CELLS = 64  # along a side
 CELL_SIZES = (1.5, 100.0)  # m
 BLOCK_AXES = ("x", "y", "xy", "yz", "xz", "xyz")
@@ -52,12 +53,12 @@ class Arena:
     @property
     def wall_height(self) -> float:
         """Height of the walls above the floor, in m."""
-        return HEIGHT * self.cell
+        return HEIGHT
 
     @cached_property
     def floor_height(self) -> float:
         """Height of the floor, in m: 0 unless there are cells without floor."""
-        return HEIGHT * self.cell if any(self.cells(CHASM)) else 0.0
+        return HEIGHT if any(self.cells(CHASM)) else 0.0
 
     @cached_property
     def bounds(self) -> np.ndarray:

@@ -30,7 +30,10 @@ class Body(Protocol):
     state_dim: int
     action_size: int
     dt: float
-    engine: str
+
+    @property
+    def engine(self) -> str:
+        """The physics engine."""
 
     def init(self, rng: jax.Array, position: jax.Array) -> Any:
         """The data at the start of an episode, near `position` [2]."""
@@ -95,7 +98,6 @@ class MazeEnv(Env):
         self.name = name
         self.arena: Arena = task.arena
         self.episode_length = episode_length
-        self.engine = body.engine
         self.state_dim = body.state_dim
         self.dt = body.dt
         self.success_radius = success_radius
@@ -121,6 +123,11 @@ class MazeEnv(Env):
     def action_size(self) -> int:
         """Length of an action."""
         return self._body.action_size
+
+    @property
+    def engine(self) -> str:
+        """The physics engine that is used; on its first use JAX looks for its devices."""
+        return self._body.engine
 
     @property
     def backend(self) -> str:

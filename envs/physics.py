@@ -15,6 +15,7 @@ import importlib.util
 import os
 import threading
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -70,16 +71,29 @@ StepBatch = Callable[[PhysicsState, jax.Array], PhysicsState]
 class Physics:
     """A model and the engine that steps it, `frames` time steps to an env step.
 
-    `init` and `step` are pure functions of one simulation, for jit, scan and vmap.
+    `init` and `step` are pure functions of one simulation, for jit, scan and vmap. JAX's devices are first touched
+    when `engine` or `step` is used: making a `Physics` takes no device memory.
     """
 
     def __init__(self, model: mujoco.MjModel, *, engine: str, frames: int):
-        """`engine` is a name that `resolve_engine` returns."""
+        """`engine` is one of `tasks.ENGINES`; raises `EnvError` if this machine plainly lacks what it needs."""
+        if engine == "warp":
+            _require(nvidia=os.path.exists("/proc/driver/nvidia") or os.path.exists("/dev/nvidia0"))
         self.model = model
-        self.engine = engine
+        self.frames = frames
         self.dt = frames * model.opt.timestep
         self.mocap_pos = model.body_pos[model.body_mocapid >= 0].astype(np.float32)
-        self._step = flattened(_ENGINES[engine](model, frames))
+        self._wanted = engine
+
+    @cached_property
+    def engine(self) -> str:
+        """The engine that is used."""
+        return resolve_engine(self._wanted)
+
+    @cached_property
+    def _step(self) -> StepBatch:
+        with jax.ensure_compile_time_eval():  # the first use may be inside a function that is being traced
+            return flattened(_ENGINES[self.engine](self.model, self.frames))
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """A simulation at rest in every respect but position [nq] and velocity [nv]; mocap bodies at their places."""
@@ -103,15 +117,24 @@ def resolve_engine(engine: str) -> str:
     Raises:
       EnvError: if the package or the device that `warp` needs is missing.
     """
-    if engine not in ("auto", "warp"):
+    if engine == "warp":
+        _require(nvidia=_has_nvidia_gpu())
+    if engine != "auto":
         return engine
-    nvidia, warp = _has_nvidia_gpu(), importlib.util.find_spec("warp") is not None
-    if nvidia and warp:
+    if _has_nvidia_gpu() and _has_warp():
         return "warp"
-    if engine == "auto":
-        return "native" if jax.default_backend() == "cpu" else "jax"
-    lacking = [need for need, met in (("an NVIDIA GPU", nvidia), ('pip install "star-rl[warp]"', warp)) if not met]
-    raise EnvError(f'engine "warp" needs {" and ".join(lacking)}; here choose native, jax or auto')
+    return "native" if jax.default_backend() == "cpu" else "jax"
+
+
+def _require(*, nvidia: bool) -> None:
+    needs = (("an NVIDIA GPU", nvidia), ('pip install "star-rl[warp]"', _has_warp()))
+    lacking = [need for need, met in needs if not met]
+    if lacking:
+        raise EnvError(f'engine "warp" needs {" and ".join(lacking)}; here choose native, jax or auto')
+
+
+def _has_warp() -> bool:
+    return importlib.util.find_spec("warp") is not None
 
 
 def _has_nvidia_gpu() -> bool:

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from envs.arena import HEIGHT
 from envs.tasks import Switch, Task
 
 MAX_SPEED = 4.0  # m/s along each axis
@@ -118,8 +119,8 @@ class Point:
 
     def pose(self, data: PointState) -> tuple[Any, Any]:
         """(qpos [2], mocap_pos [gates, 3])."""
-        gates, height = self._arena.gates(), self._arena.wall_height
-        z = jnp.where(data.open > 0, 2.5, 0.5) * height
+        gates = self._arena.gates()
+        z = jnp.where(data.open > 0, 2.5, 0.5) * HEIGHT
         centres = (gates[:, :2] + gates[:, 2:]) / 2
         return data.position, jnp.concatenate([centres, jnp.full((len(gates), 1), z)], axis=1)
 

@@ -5,6 +5,8 @@
     block   a body on slide joints: light, 1 % smaller than its cell, with stiff contacts (BLOCK_SOLIMP)
     gate    a mocap body, lifted out of the way by whoever steps the model
 
+A block begins a tenth of a millimetre inside the floor it stands on, since MJX-Warp misses boxes that merely touch.
+
 Geoms that stand still have contype 0 and conaffinity 1, so that they never meet each other, and no margin of their
 own, so that contacts begin at the body's margin: MuJoCo adds the margins of two geoms. All take the other contact
 parameters of the body's default class.
@@ -18,7 +20,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from envs.arena import BLOCK, Arena
+from envs.arena import BLOCK, HEIGHT, Arena
 
 FLOOR_COLOUR = (0.8, 0.8, 0.8, 1.0)
 WALL_COLOUR = (0.4, 0.5, 0.6, 1.0)
@@ -26,6 +28,7 @@ BLOCK_COLOUR = (0.75, 0.35, 0.25, 1.0)
 GATE_COLOUR = (0.35, 0.55, 0.4, 1.0)
 BLOCK_SHRINK = 0.99  # side of a block over the side of its cell
 BLOCK_MASS = 0.001  # kg
+BLOCK_SUNK = 1e-4  # m
 # The ant's soft contacts give way by .3 m under a bridge of 1 g, because MuJoCo scales stiffness with mass.
 BLOCK_SOLIMP = (0.99, 0.999, 0.001)
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
@@ -36,7 +39,7 @@ def build_model(arena: Arena, body: mujoco.MjSpec, options: Mapping[str, Any], *
     """The `MjModel` of `body` in `arena`. `options` are attributes of `MjSpec.option`.
 
     The joints of `body` come first, then the slides of the blocks in the order of x, y, z. With `visual` the floor
-    has a checkered texture; the physics are the same.
+    has a checkered texture and the walls of small cells are lower; places and joints are the same.
     """
     for name, value in options.items():
         setattr(body.option, name, value)
@@ -54,7 +57,7 @@ def build_model(arena: Arena, body: mujoco.MjSpec, options: Mapping[str, Any], *
     )
     raised = arena.floors() if arena.floor_height else []
     floors = [_box(world, f"floor_{i}", r, 0.0, arena.floor_height, FLOOR_COLOUR) for i, r in enumerate(raised)]
-    top = arena.floor_height + arena.wall_height
+    top = arena.floor_height + (min(HEIGHT, arena.cell / 2) if visual else HEIGHT)
     for i, rectangle in enumerate(arena.walls()):
         _box(world, f"wall_{i}", rectangle, 0.0, top, WALL_COLOUR)
     for i, centre in enumerate(arena.centres(BLOCK)):
@@ -79,11 +82,11 @@ def _box(parent: Any, name: str, rectangle: np.ndarray, low: float, high: float,
 
 def _add_block(world: Any, name: str, centre: np.ndarray, arena: Arena) -> None:
     half = arena.cell / 2
-    body = world.add_body(name=name, pos=[*centre, arena.floor_height + arena.wall_height / 2])
+    body = world.add_body(name=name, pos=[*centre, arena.floor_height + HEIGHT / 2 - BLOCK_SUNK])
     body.add_geom(
         name=name,
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=[BLOCK_SHRINK * half, BLOCK_SHRINK * half, arena.wall_height / 2],
+        size=[BLOCK_SHRINK * half, BLOCK_SHRINK * half, HEIGHT / 2],
         mass=BLOCK_MASS,
         rgba=BLOCK_COLOUR,
         contype=1,
@@ -108,9 +111,8 @@ def _add_block(world: Any, name: str, centre: np.ndarray, arena: Arena) -> None:
 
 def _add_gate(world: Any, name: str, rectangle: np.ndarray, arena: Arena) -> None:
     centre, half = (rectangle[:2] + rectangle[2:]) / 2, (rectangle[2:] - rectangle[:2]) / 2
-    height = arena.wall_height / 2
-    body = world.add_body(name=name, mocap=True, pos=[*centre, arena.floor_height + height])
-    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, height], rgba=GATE_COLOUR, **STATIC)
+    body = world.add_body(name=name, mocap=True, pos=[*centre, arena.floor_height + HEIGHT / 2])
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, HEIGHT / 2], rgba=GATE_COLOUR, **STATIC)
 
 
 def _checker(spec: mujoco.MjSpec, floors: list[Any], *, cell: float) -> None:

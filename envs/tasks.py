@@ -1,11 +1,11 @@
 """The registry: one row of data for each task. Nothing here needs JAX or MuJoCo.
 
-A row is written in m at the row's own size of cells; `Task.resized` scales it.
+A row is written in m at the row's own size of cells; `Task.resized` scales its x and y.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -41,8 +41,11 @@ class Places:
     upper: tuple[Point, ...]
 
     def resized(self, ratio: float) -> Places:
-        """All places `ratio` times as far from the origin."""
-        return Places(_scaled(self.lower, ratio), _scaled(self.upper, ratio))
+        """All places `ratio` times as far from the origin in x and y."""
+        return Places(
+            tuple(_scaled(corner, ratio) for corner in self.lower),
+            tuple(_scaled(corner, ratio) for corner in self.upper),
+        )
 
 
 @dataclass(frozen=True)
@@ -60,13 +63,14 @@ class Geometry:
     subgoal_scale: Point
 
     def resized(self, ratio: float) -> Geometry:
-        """The same geometry at `ratio` times the size."""
-        lower, upper = _scaled(self.space, ratio)
+        """The same geometry at `ratio` times the size in x and y."""
+        lower, upper = self.space
+        ratios = [ratio if i in (0, 1) else 1.0 for i in self.abstract_indices]
         return replace(
             self,
-            space=(lower, upper),
-            region_cuts=_scaled(self.region_cuts, ratio),
-            subgoal_scale=_scaled((self.subgoal_scale,), ratio)[0],
+            space=(_scaled(lower, ratio), _scaled(upper, ratio)),
+            region_cuts=tuple(tuple(r * cut for cut in cuts) for r, cuts in zip(ratios, self.region_cuts, strict=True)),
+            subgoal_scale=_scaled(self.subgoal_scale, ratio),
         )
 
 
@@ -80,7 +84,7 @@ class Switch:
 
     def resized(self, ratio: float) -> Switch:
         """The same switch at `ratio` times the size."""
-        return replace(self, lower=_scaled((self.lower,), ratio)[0], upper=_scaled((self.upper,), ratio)[0])
+        return replace(self, lower=_scaled(self.lower, ratio), upper=_scaled(self.upper, ratio))
 
 
 @dataclass(frozen=True)
@@ -130,8 +134,9 @@ class Task:
         return options | {key: replace(options[key], default=value) for key, value in self.defaults.items()}
 
 
-def _scaled(points: Iterable[Point], ratio: float) -> Any:
-    return tuple(tuple(ratio * x for x in point) for point in points)
+def _scaled(point: Point, ratio: float) -> Point:
+    """`point` with x and y, its first two coordinates, `ratio` times as large."""
+    return (ratio * point[0], ratio * point[1], *point[2:])
 
 
 MAP = Option(None, lambda value: isinstance(value, str) and bool(value), "the path of a map, or its rows")

@@ -61,7 +61,7 @@ def test_model_has_one_box_for_each_merged_wall():
     centres, halves = model.geom_pos[boxes], model.geom_size[boxes]
     np.testing.assert_allclose(np.hstack([(centres - halves)[:, :2], (centres + halves)[:, :2]]), MAZE.walls())
     np.testing.assert_allclose(centres[:, 2] - halves[:, 2], 0.0)
-    np.testing.assert_allclose(centres[:, 2] + halves[:, 2], MAZE.wall_height)
+    np.testing.assert_allclose(centres[:, 2] + halves[:, 2], 4.0)
 
 
 def test_every_ant_geom_meets_floor_and_walls_and_no_other_pair_meets():
