@@ -124,7 +124,8 @@ def read(source: str, *, cell: float) -> Arena:
     Raises:
       EnvError: in one line that names the file, and the row and column counted from 1.
     """
-    if "\n" in source.strip():
+    source = source.strip()
+    if "\n" in source:
         return check(Arena(_rows(source), cell), name="map")
     path = Path(source)
     try:

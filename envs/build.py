@@ -31,11 +31,11 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
         raise EnvError(f'engine "{engine}" is not one of {name}; {known(engine, task.engines)}')
     chosen = resolve(name, task.options(), options)
     if chosen.get("map") is not None:
-        task = tasks.own(task.body, chosen["map"], cell=task.arena.cell)
+        task = tasks.own(task.body, chosen["map"], cell=chosen["cell"])
         for key, sets in (("goals", task.goals), ("start", task.starts)):
             if chosen[key] not in sets:
                 raise EnvError(f'option "{key}" of a map is {chosen[key]!r}; allowed: {", ".join(sets)}')
-    if chosen["cell"] is not None:
+    elif chosen["cell"] is not None:
         task = task.resized(chosen["cell"])
     radius = chosen["success_radius"]
     return MazeEnv(

@@ -224,9 +224,14 @@ def maze(body: str, arena: Arena, **columns: Any) -> Task:
     return Task(body=body, arena=arena, **row)
 
 
-def own(body: str, source: str, *, cell: float) -> Task:
-    """The row of a map of the user's own; raises `EnvError` if the map is malformed."""
-    return maze(body, arenas.read(source, cell=cell), maps=True)
+def own(body: str, source: str, *, cell: float | None) -> Task:
+    """The row of a map of the user's own, with cells of `cell` m or else of the map's size, or 8 m.
+
+    Raises:
+      EnvError: if the map is malformed.
+    """
+    arena = arenas.read(source, cell=8.0)
+    return maze(body, arena if cell is None else arenas.resized(arena, cell), maps=True)
 
 
 # The published tasks (star.md of the paper's experiments): 8 m cells, success within 5 m.

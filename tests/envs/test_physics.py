@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs.tasks import TASKS
 
 STARTS = 20
 
@@ -16,31 +17,38 @@ def body():
     return ant_body("native")
 
 
-def ant_body(engine):
-    return envs.make("ant_maze", engine=engine).body
+def ant_body(engine, task="ant_maze"):
+    return envs.make(task, engine=engine).body
 
 
 def simulations(physics, qpos, qvel):
     return jax.vmap(physics.init)(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
 
 
-def random_starts(model, n=STARTS, seed=0):
-    """Ants low above the floor, so that many of them touch it, and torques."""
+def random_starts(model, n=STARTS, seed=0, floor=0.0):
+    """Ants low above the floor, so that many of them touch it, and torques; blocks move but stand where they are."""
     rng = np.random.default_rng(seed)
-    qpos = model.qpos0 + rng.uniform(-0.3, 0.3, (n, model.nq))
-    qpos[:, 2] = rng.uniform(0.25, 0.6, n)
+    qpos = np.tile(model.qpos0, (n, 1))
+    qpos[:, :15] += rng.uniform(-0.3, 0.3, (n, 15))
+    qpos[:, 2] = floor + rng.uniform(0.25, 0.6, n)
     qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     return qpos, rng.normal(size=(n, model.nv)), rng.uniform(-30, 30, (n, model.nu))
 
 
-def test_native_engine_is_mujoco(body):
-    qpos, qvel, ctrl = random_starts(body.physics.model)
+@pytest.mark.parametrize("task", ["ant_maze", "ant_fall", "ant_push", "ant_maze_cam"])
+def test_native_engine_is_mujoco(task):
+    body = ant_body("native", task)
+    qpos, qvel, ctrl = random_starts(body.physics.model, floor=TASKS[task].arena.floor_height)
+    qpos[:5, :2] = (6.6, 0.0)  # some of them near a wall of the Ant Maze and near the block of Ant Fall
     data = simulations(body.physics, qpos, qvel)
+    moved = np.where(np.arange(STARTS) % 2, 3.0, 0.0)[:, None]  # a gate lifted by 3 m in half of them
+    data = data.replace(mocap_pos=data.mocap_pos.at[:, :, 2].add(moved))
     after = jax.jit(jax.vmap(body.physics.step))(data, ctrl)
     contacts = 0
     for i in range(STARTS):
         plain = mujoco.MjData(body.physics.model)
         plain.qpos, plain.qvel, plain.ctrl = data.qpos[i], data.qvel[i], ctrl[i].astype(np.float32)
+        plain.mocap_pos = data.mocap_pos[i]
         for _ in range(5):
             mujoco.mj_step(body.physics.model, plain)
         contacts += plain.ncon

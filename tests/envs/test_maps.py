@@ -1,0 +1,105 @@
+import jax
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import envs
+from envs import arena as arenas
+from envs.arena import Arena
+from envs.tasks import TASKS
+
+OWN = """
+11111
+1r001
+11101
+1g001
+11111
+"""
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        ("11111\n1r001\n1111", ["row 3", "4 cells", "row 1 has 5"]),
+        ("11111\n10001\n11111", ["no start", '"r"']),
+        ("11111\n1r0x1\n11111", ["row 2, column 4", "'x'", "1 0 r g # B D"]),
+        ("11111\n1r1g1\n11111", ["goal", "row 2, column 4", "cannot be reached"]),
+        ("11111\n1r#g1\n11111", ["goal", "row 2, column 4", "cannot be reached"]),
+        ("11111\n1r00g\n11111", ["row 2, column 5", "'g'", "outline"]),
+        ("111\n1r1\n111", ["no free cell"]),
+        ("1" * 65 + "\n" + "1r0" + "1" * 62, ["65", "64"]),
+    ],
+)
+def test_a_malformed_map_is_told_by_row_and_column(rows, words):
+    for name in ("point_maze", "ant_maze"):
+        with pytest.raises(envs.EnvError) as caught:
+            envs.make(name, map=rows)
+        message = str(caught.value)
+        assert "\n" not in message
+        assert all(word in message for word in words)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.yaml", "map: [1", ["is not YAML"]),
+        ("a.yaml", "rows: |\n  111", ["block of text"]),
+        ("a.yaml", "map: |\n  111\nsize: 3", ['"size"', "map, cell, block"]),
+        ("a.yaml", "map: |\n  111\ncell: big", ["'big'", "1.5 to 100"]),
+        ("a.yaml", "map: |\n  111\ncell: .nan", ["nan", "1.5 to 100"]),
+        ("a.yaml", "map: |\n  111\nblock: zz", ["'zz'", "yz"]),
+        ("a.txt", "", ["is empty"]),
+    ],
+)
+def test_a_malformed_file_is_told_by_its_path(tmp_path, name, text, words):
+    path = tmp_path / name
+    path.write_text(text)
+    with pytest.raises(envs.EnvError) as caught:
+        envs.make("point_maze", map=str(path))
+    message = str(caught.value)
+    assert "\n" not in message and str(path) in message
+    assert all(word in message for word in words)
+
+
+def test_a_file_that_is_not_there_or_not_text_is_told(tmp_path):
+    with pytest.raises(envs.EnvError, match="cannot be read"):
+        envs.make("point_maze", map=str(tmp_path / "none.txt"))
+    (tmp_path / "binary.txt").write_bytes(bytes(range(128, 256)))
+    with pytest.raises(envs.EnvError, match="not a text file"):
+        envs.make("point_maze", map=str(tmp_path / "binary.txt"))
+
+
+@given(st.text(alphabet="10rg#BD\n x", max_size=40).map(lambda text: text + "\n\n."))
+def test_any_text_is_a_map_or_refused_in_one_line(text):
+    try:
+        arena = arenas.read(text, cell=4.0)
+    except envs.EnvError as error:
+        assert "\n" not in str(error)
+    else:
+        assert arena.free().size
+
+
+def test_text_yaml_and_rows_give_the_same_arena(tmp_path):
+    (tmp_path / "own.txt").write_text(OWN)
+    (tmp_path / "own.yaml").write_text("cell: 4.0\nblock: xy\nmap: |" + OWN.replace("\n", "\n  "))
+    rows, text = arenas.read(OWN, cell=4.0), arenas.read(str(tmp_path / "own.txt"), cell=4.0)
+    assert rows == text == arenas.read(str(tmp_path / "own.yaml"), cell=8.0)
+
+
+def test_on_a_map_of_ones_own_goals_success_and_regions_follow_the_map():
+    env = envs.make("point_maze", map=OWN, cell=4.0, goals="test")
+    assert env.success_radius == 2.5
+    assert [corner.tolist() for corner in env.space] == [[-2.0, -2.0], [10.0, 10.0]]
+    assert env.region_cuts == ((4.0,), (4.0,))
+    assert TASKS["point_maze"].goals["test"].lower == ((0.0, 16.0),)
+    assert env.reset(jax.random.key(0)).obs[-2:].tolist() == [0.0, 8.0]
+
+
+def test_without_marked_goals_the_test_goal_is_the_longest_walk_away():
+    assert arenas.farthest(TASKS["ant_maze"].arena) == (0.0, 16.0)
+    assert arenas.farthest(Arena(("11111", "10r01", "10111", "11111"), 2.0)) == (-2.0, 2.0)
+
+
+@pytest.mark.parametrize("name", envs.names())
+def test_the_maps_of_all_tasks_are_sound(name):
+    arenas.check(TASKS[name].arena, name=name)

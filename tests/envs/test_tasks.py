@@ -1,0 +1,224 @@
+"""Every row of the registry: goals, starts, options, and what importing costs."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import envs
+from envs import maze
+from envs.tasks import TASKS, Places
+
+DRAWS = 10_000
+ANT_TASKS = [name for name in envs.names() if name.startswith("ant_")]
+
+
+def draws(places, seed=0):
+    return np.asarray(jax.vmap(lambda key: maze.sample(places, key))(jax.random.split(jax.random.key(seed), DRAWS)))
+
+
+def slow_shares(places):
+    """The probability of each box, from its volume."""
+    volumes = []
+    for lower, upper in zip(places.lower, places.upper, strict=True):
+        sides = [high - low for low, high in zip(lower, upper, strict=True) if high > low]
+        volumes.append(float(np.prod(sides)) if sides else 0.0)
+    return np.array(volumes) / sum(volumes) if any(volumes) else np.full(len(volumes), 1 / len(volumes))
+
+
+def test_goals_and_starts_follow_the_stated_distributions():
+    """Chi-square over boxes, and over four parts of each side within the boxes."""
+    sets = {places for task in TASKS.values() for places in (*task.goals.values(), *task.starts.values())}
+    assert len(sets) > 30
+    for places in sets:
+        drawn = draws(places)
+        lower, upper = np.array(places.lower), np.array(places.upper)
+        inside = ((drawn[:, None] >= lower - 1e-4) & (drawn[:, None] <= upper + 1e-4)).all(axis=2)
+        assert (inside.sum(axis=1) == 1).all(), "outside, or boxes overlap"
+        box = inside.argmax(axis=1)
+        if len(lower) > 1:
+            counts = np.bincount(box, minlength=len(lower))
+            assert stats.chisquare(counts, DRAWS * slow_shares(places)).pvalue > 1e-5
+        for axis in np.flatnonzero((upper > lower).all(axis=0)):
+            part = (drawn[:, axis] - lower[box, axis]) / (upper - lower)[box, axis]
+            counts = np.bincount(np.clip((4 * part).astype(int), 0, 3), minlength=4)
+            assert stats.chisquare(counts).pvalue > 1e-5
+
+
+def test_boxes_are_chosen_by_volume():
+    places = Places(lower=((0.0, 0.0), (10.0, 0.0)), upper=((1.0, 1.0), (13.0, 1.0)))
+    assert (draws(places)[:, 0] > 5).mean() == pytest.approx(0.75, abs=0.02)
+
+
+@pytest.mark.parametrize("name", ["ant_fall", "ant_maze_sparse", "point_maze_cam", "point_big_maze"])
+def test_resets_use_the_goals_and_starts_of_the_options(name):
+    env = envs.make(name, **({"engine": "native"} if name in ANT_TASKS else {}), goals="free", start="free")
+    keys = jax.random.split(jax.random.key(0), 200)
+    obs = np.asarray(jax.vmap(env.reset)(keys).obs)
+    arena = env.arena
+    for points in (obs[:, :2], obs[:, env.state_dim :][:, :2]):
+        column, row = np.rint(points / arena.cell).astype(int).T
+        symbols = {arena.rows[r + arena.origin[0]][c + arena.origin[1]] for r, c in zip(row, column, strict=True)}
+        assert symbols <= set("0rg")
+        assert len(np.unique(points, axis=0)) > min(len(arena.centres("0rg")), 100) / 2
+
+
+def test_published_maps_goals_and_radii():
+    rows = {name: TASKS[name] for name in ("ant_maze", "ant_maze_cam", "ant_fall", "ant_push", "ant_maze_sparse")}
+    assert rows["ant_fall"].goals["test"].lower == ((0.0, 27.0, 4.5),)
+    assert rows["ant_push"].goals["test"].lower == ((0.0, 19.0),)
+    assert rows["ant_maze_sparse"].goals["test"].lower == ((2.0, 9.0),)
+    assert [row.success_radius for row in rows.values()] == [5.0, 5.0, 5.0, 5.0, 1.0]
+    assert [row.arena.cell for row in rows.values()] == [8.0, 8.0, 8.0, 8.0, 2.0]
+    np.testing.assert_array_equal(rows["ant_fall"].arena.centres("B"), [[8.0, 8.0]])
+    np.testing.assert_array_equal(rows["ant_fall"].arena.chasms(), [[-4.0, 12.0, 12.0, 20.0]])
+    assert TASKS["ant_maze_sparse"].options()["reward"].default == "sparse"
+
+
+def test_jaxgcrl_mazes_keep_their_first_index_as_x():
+    big = TASKS["ant_big_maze"]
+    test_goals = set(big.goals["test"].lower)
+    # rows of the published map that hold goals for evaluation, (row, column) - (1, 1) times 4 m
+    cells = [(1, 5), (1, 6), (2, 5), (2, 6), (5, 3), (5, 6), (6, 2), (6, 3), (6, 5), (6, 6)]
+    assert test_goals == {(4.0 * (r - 1), 4.0 * (c - 1)) for r, c in cells}
+    assert len(TASKS["ant_hardest_maze"].goals["train"].lower) == 45
+    assert (big.success_radius, big.arena.cell) == (0.5, 4.0)
+
+
+def test_cells_of_another_size_scale_x_and_y_and_leave_heights():
+    env = envs.make("ant_fall", engine="native", cell=4.0, goals="test")
+    assert [corner.tolist() for corner in env.space] == [[-2.0, -2.0, 0.0], [6.0, 14.0, 8.0]]
+    assert env.region_cuts == ((2.0,), (6.0,), ()) and env.subgoal_scale == (5.0, 5.0, 0.5)
+    assert env.reset(jax.random.key(0)).obs[-3:].tolist() == [0.0, 13.5, 4.5]
+    assert env.arena.floor_height == 4.0
+
+
+def test_sparse_reward_pays_success_and_only_that():
+    env = envs.make("point_maze", reward="sparse", success_radius=2.0)
+    state = env.reset(jax.random.key(0))
+    for goal, paid in (((0.0, 1.5), 1.0), ((0.0, 2.5), 0.0)):
+        after = env.step(state.replace(info={**state.info, "goal": jnp.array(goal)}), jnp.zeros(2))
+        assert (float(after.reward), float(after.metrics["success"])) == (paid, paid)
+        assert float(after.metrics["distance"]) == pytest.approx(goal[1], abs=0.2)
+
+
+def test_rewards_of_arrays_are_those_of_single_goals():
+    rng = np.random.default_rng(0)
+    achieved, desired = rng.normal(0, 4, (5, 7, 2)), rng.normal(0, 4, (5, 7, 2))
+    for options in ({}, {"reward": "sparse"}):
+        env = envs.make("point_maze", **options)
+        together = env.reward(achieved, desired)
+        for i in np.ndindex(5, 7):
+            distance = np.hypot(*(achieved[i] - desired[i]))
+            assert together[i] == pytest.approx(float(distance < 5) if options else -distance)
+
+
+def test_noise_on_positions_has_the_given_size_and_is_off_by_default():
+    def travelled(**options):
+        env = envs.make("point_maze", **options)
+        states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 500))
+        still = states.replace(
+            pipeline_state=states.pipeline_state.replace(
+                data=states.pipeline_state.data.replace(velocity=jnp.zeros((500, 2)))
+            )
+        )
+        step = jax.vmap(env.step)
+        after = step(step(still, jnp.zeros((500, 2))), jnp.zeros((500, 2)))
+        return np.asarray(after.obs[:, :2] - still.obs[:, :2])
+
+    assert (travelled() == 0).all()
+    np.testing.assert_allclose(travelled(position_noise=0.05).std(axis=0), 0.05 * np.sqrt(2), rtol=0.1)
+
+
+def test_noise_moves_the_ant_too():
+    env = envs.make("ant_maze", engine="native", position_noise=0.1)
+    data = env.body.init(jax.random.key(0), jnp.zeros(2))
+    moved = env.body.displace(data, jnp.array([1.0, -2.0]))
+    np.testing.assert_allclose(moved.qpos[:2] - data.qpos[:2], [1.0, -2.0], rtol=1e-5)
+    np.testing.assert_array_equal(moved.qpos[2:], data.qpos[2:])
+
+
+def test_the_action_scale_multiplies_actions():
+    point = envs.make("point_maze", action_scale=0.5)
+    state = point.reset(jax.random.key(0))
+    half = point.step(state, jnp.ones(2)).obs
+    np.testing.assert_allclose(half, envs.make("point_maze").step(state, 0.5 * jnp.ones(2)).obs, rtol=1e-6)
+    ant = envs.make("ant_maze", engine="native", action_scale=2.0).body
+    np.testing.assert_array_equal(ant.physics.model.actuator_ctrlrange, np.tile([-60.0, 60.0], (8, 1)))
+
+
+def test_only_torso_and_shins_collide_with_feet():
+    model = envs.make("ant_maze", engine="native", collisions="feet").body.physics.model
+    names = {model.geom(i).name for i in np.flatnonzero(model.geom_contype)}
+    assert names == {"torso", "shin_1", "shin_2", "shin_3", "shin_4"}
+
+
+@pytest.mark.parametrize("flip", ["ignore", "terminate", "truncate"])
+def test_a_flipped_ant_ends_the_episode_only_if_asked_and_stays_ended(flip):
+    env = envs.make("ant_maze", engine="native", flip=flip)
+    state = env.reset(jax.random.key(0))
+    over = jnp.array([0.0, 1.0, 0.0, 0.0])  # on its back
+    data = state.pipeline_state.data
+    upside_down = data.replace(qpos=data.qpos.at[3:7].set(over), qvel=jnp.zeros_like(data.qvel))
+    step = jax.jit(env.step)
+    after = step(state.replace(pipeline_state=state.pipeline_state.replace(data=upside_down)), jnp.zeros(8))
+    flags = {"ignore": (0.0, 0.0), "terminate": (1.0, 0.0), "truncate": (1.0, 1.0)}[flip]
+    assert (float(after.done), float(after.info["truncation"])) == flags
+    assert float(after.metrics["flipped"]) == 1.0
+    upright = after.replace(pipeline_state=after.pipeline_state.replace(data=data))
+    again = step(upright, jnp.zeros(8))
+    assert (float(again.done), float(again.info["truncation"])) == flags
+    assert bool((again.obs == after.obs).all()) == (flip != "ignore")
+
+
+def test_dropped_contacts_end_the_episode_and_are_counted_once():
+    env = envs.make("ant_maze", engine="native")
+    state = env.reset(jax.random.key(0))
+    full = state.replace(
+        pipeline_state=state.pipeline_state.replace(
+            data=state.pipeline_state.data.replace(overflow=jnp.ones(()))  # native hands it on
+        )
+    )
+    after = env.step(full, jnp.zeros(8))
+    assert (float(after.done), float(after.info["truncation"]), float(after.metrics["overflow"])) == (1.0, 1.0, 1.0)
+    np.testing.assert_array_equal(after.obs, state.obs)
+    assert float(env.step(after, jnp.zeros(8)).metrics["overflow"]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "extra"),
+    [("ant_fall", 4), ("ant_push", 4), ("ant_maze_stochastic", 2), ("ant_maze_cam", 1), ("ant_maze", 0)],
+)
+def test_the_full_observation_appends_what_is_hidden(name, extra):
+    env = envs.make(name, engine="native", observe="full")
+    state = env.reset(jax.random.key(0))
+    data = state.pipeline_state.data
+    assert env.state_dim == 30 + extra
+    hidden = state.obs[30 : env.state_dim]
+    flag = [0.0] if name == "ant_maze_cam" else []
+    np.testing.assert_array_equal(hidden, np.concatenate([data.qpos[15:], data.qvel[14:], flag]))
+    plain = envs.make(name, engine="native").reset(jax.random.key(0))
+    np.testing.assert_array_equal(plain.obs[:30], state.obs[:30])
+
+
+def test_the_block_of_the_stochastic_maze_starts_elsewhere_every_time():
+    env = envs.make("ant_maze_stochastic", engine="native")
+    keys = jax.random.split(jax.random.key(0), 2000)
+    slid = np.asarray(jax.vmap(env.reset)(keys).pipeline_state.data.qpos)[:, 15]
+    assert stats.kstest(slid, "norm").pvalue > 1e-4
+
+
+def test_names_cost_no_jax_and_making_no_device():
+    code = (
+        "import sys, envs\n"
+        "assert len(envs.names()) > 15 and not {'jax', 'mujoco', 'brax'} & set(sys.modules)\n"
+        "[envs.make(name) for name in envs.names()]\n"
+        "from jax._src import xla_bridge\n"
+        "assert not xla_bridge.backends_are_initialized()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
