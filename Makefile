@@ -1,5 +1,7 @@
-# The Python that .venv is made from (3.11 or 3.12), and what pytest is given.
+# The Python that .venv is made from (3.11 or 3.12), the extras that the tests have (with sb3, those of
+# Stable-Baselines3 are not skipped), and what pytest is given.
 PYTHON ?= python3
+TEST_EXTRAS ?= test
 PYTEST_ARGS ?= -n 2 --dist loadfile
 CONFIG ?= configs/point_maze.yaml
 
@@ -25,11 +27,11 @@ test: lint ## lint, check the types, run the tests (PYTEST_ARGS=...)
 	$(BIN)/python -m mypy star envs
 	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
 
-lint: $(VENV)/.test ## ruff: rules and formatting
+lint: $(VENV)/.$(TEST_EXTRAS) ## ruff: rules and formatting
 	$(BIN)/python -m ruff check
 	$(BIN)/python -m ruff format --check
 
-format: $(VENV)/.test ## ruff: repair and format
+format: $(VENV)/.$(TEST_EXTRAS) ## ruff: repair and format
 	$(BIN)/python -m ruff check --fix
 	$(BIN)/python -m ruff format
 
@@ -51,7 +53,7 @@ $(VENV)/.run: $(PINS) | $(BIN)/python
 	$(INSTALL) .
 	@touch $@
 
-$(VENV)/.test $(VENV)/.docs: $(VENV)/.%: $(PINS) | $(BIN)/python
+$(VENV)/.$(TEST_EXTRAS) $(VENV)/.docs: $(VENV)/.%: $(PINS) | $(BIN)/python
 	@echo "installing into $(VENV) (a minute or two)"
 	$(INSTALL) '.[$*]'
 	@touch $@ $(VENV)/.run

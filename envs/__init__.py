@@ -4,16 +4,20 @@
 >>> env = envs.VectorEnv(envs.make("point_maze"), 64)
 
 `envs` knows nothing of agents. See docs/environments.md for every task, option and convention. What needs JAX is
-imported when it is first used.
+imported when it is first used. Where Gymnasium is installed, its ids of the tasks are registered (docs/gymnasium.md).
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 from typing import TYPE_CHECKING, Any
 
 from envs.options import EnvError
 from envs.tasks import names
+
+with contextlib.suppress(ModuleNotFoundError):
+    from envs import registration as registration
 
 if TYPE_CHECKING:
     from envs.build import make

@@ -116,27 +116,29 @@ class Arena:
 
 
 def read(source: str, *, cell: float) -> Arena:
-    """The arena of a user's map: a file, or the rows themselves if `source` has several lines.
+    """The arena of a user's map: the path of a file, or what would be in it if `source` has several lines.
 
-    A file is either the rows as plain text, or YAML (`.yaml`, `.yml`) with the rows as a block of text under `map`
-    and, if wanted, `cell` (m) and `block` (axes). `cell` is the size of cells that the map does not give.
+    It is either the rows as plain text, or YAML with the rows as a block of text under `map` and, if wanted, `cell`
+    (m) and `block` (axes). `cell` is the size of cells that the map does not give.
 
     Raises:
       EnvError: in one line that names the file, and the row and column counted from 1.
     """
     source = source.strip()
-    if "\n" in source:
-        return check(Arena(_rows(source), cell), name="map")
-    path = Path(source)
+    name, text = "map" if "\n" in source else f"map {source}", load(source)
+    return check(_from_yaml(text, cell, name=name) if ":" in text else Arena(_rows(text), cell), name=name)
+
+
+def load(source: str) -> str:
+    """The text of a map given as `read` takes it; raises `EnvError` if there is no such file."""
+    if "\n" in source.strip():
+        return source
     try:
-        text = path.read_text(encoding="utf-8")
+        return Path(source).read_text(encoding="utf-8")
     except OSError as error:
         raise EnvError(f"map {source}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise EnvError(f"map {source}: is not a text file") from None
-    if path.suffix not in (".yaml", ".yml"):
-        return check(Arena(_rows(text), cell), name=f"map {source}")
-    return check(_from_yaml(text, cell, name=f"map {source}"), name=f"map {source}")
 
 
 def _rows(text: str) -> tuple[str, ...]:

@@ -60,8 +60,7 @@ class Body(Protocol):
         """(qpos, mocap_pos) of `data` in that model."""
 
 
-@struct.dataclass
-class Simulation:
+class Simulation(struct.PyTreeNode):
     """The body's data, the env steps since the last reset (int32), and the key of the noise on positions (raw).
 
     `ended` is 1.0 if the episode has ended before its time, `terminated` 1.0 if the task ended it.

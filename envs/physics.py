@@ -35,22 +35,10 @@ BLOCK_CONTACTS = 16  # more of them for each block, with 4 rows each
 MIN_POOL = 512  # contacts of a batch, however small
 OVERFLOW_BITS = 0b111111  # buffers of MJX-Warp that were too small: constraint rows, contacts, convex collisions
 
-_POOL = 512  # contacts of a batch, however small
-OVERFLOW_BITS = 0b111111  # buffers of MJX-Warp that were too small: constraint rows, contacts, convex collisions
-
-INTEGRATORS = {
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-    "euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
-}
-SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL_CG}
-CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-
 _POOL = threading.Lock()  # mujoco.rollout has one thread pool for the process, and runs one rollout at a time
 
 
-@struct.dataclass
-class PhysicsState:
+class PhysicsState(struct.PyTreeNode):
     """All that one simulation carries from step to step.
 
     qpos [nq], qvel [nv] and mocap_pos [nmocap, 3] are MuJoCo's. `warmstart` [nv] is the acceleration the solver
@@ -149,8 +137,10 @@ def _native(model: mujoco.MjModel, frames: int) -> StepBatch:
     idle = np.concatenate([[0.0], model.qpos0, np.zeros(model.nv + model.nu + 3 * model.nmocap)])
     duration = frames * model.opt.timestep
 
-    def advance(qpos: Any, qvel: Any, ctrl: Any, mocap_pos: Any) -> tuple[np.ndarray, np.ndarray]:
-        start = np.hstack([np.zeros((len(qpos), 1)), qpos, qvel, ctrl, np.reshape(mocap_pos, (len(qpos), -1))])
+    def advance(*batch: Any) -> tuple[np.ndarray, np.ndarray]:
+        qpos, qvel, ctrl, mocap_pos = map(np.asarray, batch)  # JAX must not be called from a callback
+        places = mocap_pos.reshape(len(qpos), 3 * model.nmocap)
+        start = np.hstack([np.zeros((len(qpos), 1)), qpos, qvel, ctrl, places])
         broken = ~np.isfinite(start).all(axis=1)
         start[broken] = idle  # MuJoCo would log a warning for each of them
         held = np.repeat(start[:, None, split[2] :], frames, axis=1)

@@ -27,8 +27,7 @@ START_POSITION = 0.1  # m, half-range of the start position
 START_SPEED = 0.1  # m/s, standard deviation of the start velocity
 
 
-@struct.dataclass
-class PointState:
+class PointState(struct.PyTreeNode):
     """Position [2] in m and velocity [2] in m/s; `open` [] is 1.0 once the gates are open."""
 
     position: jax.Array

@@ -55,8 +55,11 @@ def build_model(arena: Arena, body: mujoco.MjSpec, options: Mapping[str, Any], *
         rgba=FLOOR_COLOUR,
         **STATIC,
     )
-    raised = arena.floors() if arena.floor_height else []
-    floors = [_box(world, f"floor_{i}", r, 0.0, arena.floor_height, FLOOR_COLOUR) for i, r in enumerate(raised)]
+    floors = [
+        _box(world, f"floor_{i}", rectangle, 0.0, arena.floor_height, FLOOR_COLOUR)
+        for i, rectangle in enumerate(arena.floors())
+        if arena.floor_height
+    ]
     top = arena.floor_height + (min(HEIGHT, arena.cell / 2) if visual else HEIGHT)
     for i, rectangle in enumerate(arena.walls()):
         _box(world, f"wall_{i}", rectangle, 0.0, top, WALL_COLOUR)

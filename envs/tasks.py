@@ -126,9 +126,9 @@ class Task:
 
     def options(self) -> dict[str, Option]:
         """The options of the task with their defaults."""
-        options = {"goals": choice(*self.goals), "start": choice(*self.starts)} | COMMON
+        options = {"goals": choice(*self.goals), "start": choice(*self.starts), **COMMON}
         if self.maps:
-            options |= {"map": MAP}
+            options["map"] = MAP
         if self.body == "ant":
             options |= ANT
         return options | {key: replace(options[key], default=value) for key, value in self.defaults.items()}
@@ -204,24 +204,33 @@ def plane(arena: Arena) -> Geometry:
     )
 
 
-def maze(body: str, arena: Arena, **columns: Any) -> Task:
-    """A row over x and y. Unless `columns` says otherwise: goals and success as on a map of the user's own.
+def maze(
+    body: str,
+    arena: Arena,
+    *,
+    goals: Mapping[str, Places] | None = None,
+    geometry: Geometry | None = None,
+    success_radius: float | None = None,
+    **columns: Any,
+) -> Task:
+    """A row over x and y. Unless told otherwise, goals and success are as on a map of the user's own.
 
     Training goals lie anywhere in the free cells. Test goals are the cells marked `g`, else the free cell that is
     the longest walk away. Success is within 5/8 of a cell.
     """
     anywhere = around(arena, FREE + ROBOT + GOAL, clearance=CLEARANCE[body])
-    marked = GOAL if any(arena.cells(GOAL)) else None
-    goals = {"train": anywhere, "test": centres(arena, GOAL) if marked else point(*arenas.farthest(arena))}
-    row = {
-        "geometry": plane(arena),
-        "success_radius": 0.625 * arena.cell,
-        "goals": goals,
-        "starts": {"task": centres(arena, ROBOT)},
-    } | columns
-    row["goals"] = {**row["goals"], "free": anywhere}
-    row["starts"] = {**row["starts"], "free": anywhere}
-    return Task(body=body, arena=arena, **row)
+    if goals is None:
+        marked = any(arena.cells(GOAL))
+        goals = {"train": anywhere, "test": centres(arena, GOAL) if marked else point(*arenas.farthest(arena))}
+    return Task(
+        body=body,
+        arena=arena,
+        geometry=geometry or plane(arena),
+        success_radius=0.625 * arena.cell if success_radius is None else success_radius,
+        goals={**goals, "free": goals.get("free", anywhere)},
+        starts={"task": centres(arena, ROBOT), "free": anywhere},
+        **columns,
+    )
 
 
 def own(body: str, source: str, *, cell: float | None) -> Task:
@@ -260,7 +269,11 @@ MAZE_GOALS = {"train": box((-4.0, -4.0), (20.0, 20.0)), "test": point(0.0, 16.0)
 CAM_SWITCH = Switch(lower=(16.0, float("-inf")), upper=(20.0, 8.0), yaw=(-1.0, 0.0))
 
 # Goals on the far side of the chasm, seen in x, y and z: the third abstract dimension tells the chasm's bottom.
-FALL_GOALS = {"train": point(0.0, 27.0, 4.5), "test": point(0.0, 27.0, 4.5)}
+FALL_GOALS = {
+    "train": point(0.0, 27.0, 4.5),
+    "test": point(0.0, 27.0, 4.5),
+    "free": around(FALL, FREE + ROBOT, clearance=CLEARANCE["ant"], height=(4.5,)),
+}
 FALL_GEOMETRY = Geometry(
     goal_indices=(0, 1, 2),
     abstract_indices=(0, 1, 2),
@@ -342,17 +355,11 @@ def _both(body: str) -> dict[str, Task]:
     }
 
 
-def _fall() -> Task:
-    free = around(FALL, FREE + ROBOT, clearance=CLEARANCE["ant"], height=(4.5,))
-    row = maze("ant", FALL, geometry=FALL_GEOMETRY, goals=FALL_GOALS)
-    return replace(row, goals={**FALL_GOALS, "free": free})
-
-
 TASKS: Mapping[str, Task] = {
     **_both("point"),
     **_both("ant"),
     "ant_push": maze("ant", PUSH, goals={"train": point(0.0, 19.0), "test": point(0.0, 19.0)}),
-    "ant_fall": _fall(),
+    "ant_fall": maze("ant", FALL, geometry=FALL_GEOMETRY, goals=FALL_GOALS),
     "ant_maze_stochastic": maze(
         "ant", STOCHASTIC, goals={"train": box((-12.0, -4.0), (12.0, 20.0)), "test": point(0.0, 16.0)}, block_noise=1.0
     ),

@@ -1,18 +1,18 @@
-"""The command `star`: train from a config file, evaluate what came out."""
+"""The command `star`: train from a config file, evaluate and see what came out."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NoReturn
 
 import yaml
 
-from star.config import Config, ConfigError, fields, load, read_yaml
+from star.config import Config, ConfigError, fields, load, parse, read_yaml
 
 _HELP = """\
 Train a three-level agent (Commander, Tutor, Controller) whose goal regions refine themselves.
@@ -22,10 +22,16 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star train configs/ant_maze.yaml --tutor.reward distance --total-env-steps 5000000
   star train --resume runs/NAME                 go on after an interrupt
   star evaluate runs/NAME                       success on test goals, with 95 % intervals
+  star render point_maze --out maze.png         a picture of a task
+  star render --run runs/NAME --out film.html   an episode of a trained agent
   star envs                                     the tasks
   star settings [PREFIX]                        every setting, its default and its meaning
 """
 
+_RENDER = """\
+Random actions in TASK, or with --run the greedy policy of a trained agent on test goals.
+.png and .jpg hold one picture, the end of the episode; .mp4, .gif and .html the whole of it.
+A setting of the task is given as --env.options.KEY VALUE."""
 _OVERRIDES = "Any setting can be overridden: --section.key VALUE (see `star settings`)."
 
 
@@ -81,12 +87,37 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--json", action="store_true", help="print JSON")
     evaluate.set_defaults(function=_evaluate)
 
+    _add_render(commands.add_parser("render", help="pictures of a task or of an agent", description=_RENDER, **shape))
     listing = commands.add_parser("envs", help="list the tasks", **shape)
     listing.set_defaults(function=_envs)
     settings = commands.add_parser("settings", help="list every setting with its default and meaning", **shape)
     settings.add_argument("prefix", nargs="?", default="", help="only settings that begin so, such as tutor")
     settings.set_defaults(function=_settings)
     return parser
+
+
+def _add_render(render: argparse.ArgumentParser) -> None:
+    render.add_argument("task", nargs="?", help="one of `star envs`; with --run its own task")
+    render.add_argument("--out", type=Path, required=True, metavar="FILE", help=".png, .jpg, .mp4, .gif or .html")
+    render.add_argument("--run", type=Path, metavar="RUN", help="show the agent in this run directory")
+    render.add_argument("--checkpoint", metavar="last|best|STEPS", help="which one of the run (default: last)")
+    render.add_argument("--seed", type=_natural, metavar="N", help="which agent of the run (default: its first seed)")
+    render.add_argument(
+        "--evaluation-seed", type=_natural, default=0, metavar="N", help="seed of goals, starts and random actions"
+    )
+    render.add_argument(
+        "--envs", type=_count(25), default=1, metavar="N", help="environments side by side (default: 1)"
+    )
+    render.add_argument("--steps", type=_natural, metavar="N", help="env steps (default: the whole episode)")
+    render.add_argument("--every", type=_count(), default=2, metavar="N", help="draw every Nth env step (default: 2)")
+    render.add_argument("--fps", type=_count(50), default=20, metavar="N", help="pictures a second (default: 20)")
+    render.add_argument(
+        "--camera", choices=("follow", "overview", "top"), help="default: overview in a still, follow in a film"
+    )
+    render.add_argument("--height", type=_count(1080), metavar="PX", help="of the picture of one environment")
+    render.add_argument("--force", action="store_true", help="replace an existing file")
+    render.add_argument("--quiet", action="store_true", help="no progress")
+    render.set_defaults(function=_render)
 
 
 def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
@@ -123,6 +154,15 @@ def _natural(text: str) -> int:
     if not text.isdecimal() or int(text) >= 2**31:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to 2^31 - 1")
     return int(text)
+
+
+def _count(most: int = 2**31 - 1) -> Callable[[str], int]:
+    def read(text: str) -> int:
+        if not text.isdecimal() or not 1 <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {most}")
+        return int(text)
+
+    return read
 
 
 def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
@@ -172,6 +212,59 @@ def _describe(row: dict[str, Any]) -> str:
         low, high = row[f"{name}_interval"]
         parts.append(f"{name} {row[name]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]")
     return "  ".join(parts)
+
+
+def _render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    if options.run is None:
+        if options.task is None:
+            raise ConfigError("star render: give a task, or --run RUN (see star render --help)")
+        for flag in ("checkpoint", "seed"):
+            if getattr(options, flag) is not None:
+                raise ConfigError(f"--{flag}: needs --run; random actions are chosen by --evaluation-seed")
+        for key in overrides:
+            if not key.startswith("env.") and key != "trainer.device":
+                raise ConfigError(f"--{key}: random actions take only env settings and trainer.device")
+        config = parse({}, overrides | {"env.name": options.task})
+    else:
+        config = _run_config(options.run, {"env.engine": "auto"} | overrides)
+        if options.task not in (None, config.env.name):
+            raise ConfigError(f"{options.run}: its agent was trained on {config.env.name}, not on {options.task}")
+    _check_output(options)
+
+    from star import rendering
+
+    show = rendering.Show(
+        out=options.out,
+        envs=options.envs,
+        steps=options.steps,
+        every=options.every,
+        fps=options.fps,
+        camera=options.camera,
+        height=options.height,
+    )
+    print(
+        rendering.render(
+            config,
+            show,
+            run_dir=options.run,
+            checkpoint=options.checkpoint or "last",
+            agent=options.seed,
+            seed=options.evaluation_seed,
+            quiet=options.quiet,
+        )
+    )
+    return 0
+
+
+def _check_output(options: argparse.Namespace) -> None:
+    """Refuse a file that cannot be written, or a machine that cannot draw, before anything heavy is imported."""
+    from envs import EnvError, opengl, video
+
+    try:
+        video.check(options.out, force=options.force)
+        opengl.backend()
+    except EnvError as error:
+        raise ConfigError(str(error)) from None
 
 
 def _envs(options: argparse.Namespace, overrides: dict[str, Any]) -> int:

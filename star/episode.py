@@ -110,7 +110,7 @@ def play(
 
     segments = spec.episode_length // config.tutor.period
     streams, recorded = jax.lax.scan(segment, streams, jax.random.split(scan_key, segments))
-    return streams, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), recorded)
+    return streams, jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), recorded)
 
 
 def start(spec: Spec, env: VectorEnv, abstraction: Abstraction, *, key: Array) -> Streams:

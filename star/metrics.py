@@ -79,6 +79,9 @@ class Display:
             self._success = success
         if self._success is not None:
             status += f"  success {self._success:.2f}"
+        faults = sum(mean(rows, key) or 0.0 for key in ("env/non_finite", "env/overflow"))
+        if faults:
+            status += f"  simulator faults {faults:.0f}"
         self._progress.start_task(self._task)
         self._progress.update(self._task, completed=env_steps, description="training", status=status)
         if success is not None and not self._quiet and not self._console.is_terminal:

@@ -17,6 +17,7 @@ import numpy as np
 from rich.console import Console
 
 import envs
+from envs import arena
 from envs.vector import VectorEnv
 from star import episode, evaluation, hierarchy, report
 from star import state as states
@@ -28,7 +29,7 @@ from star.state import Spec, TrainState
 
 # Streams of random keys that no seed of training uses.
 _DURING_TRAINING = 2**32 - 1
-_AFTERWARDS = 2**32 - 2
+AFTERWARDS = 2**32 - 2
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Result:
 def build(config: Config) -> Program:
     """Make the environments and the jitted functions of `config`; raises `ConfigError` if they cannot be made."""
     select_device(config.trainer.device)
-    env = _make_env(config, "train")
+    env = make_env(config, "train")
     spec = Spec.of(env)
     config = _resolve(config, env.engine, spec)
     try:
@@ -81,7 +82,7 @@ def build(config: Config) -> Program:
         raise ConfigError(str(error)) from None
     agent = config.agent()
     trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
-    tested = VectorEnv(_make_env(config, "test"), config.trainer.eval_episodes, auto_reset=False)
+    tested = VectorEnv(make_env(config, "test"), config.trainer.eval_episodes, auto_reset=False)
 
     def epoch(agent: Any, state: TrainState) -> Any:
         return jax.vmap(partial(hierarchy.epoch, agent, spec, trained))(state)
@@ -123,14 +124,8 @@ def train(
 def evaluate(config: Config, run_dir: Path, *, checkpoint: str = "last", seed: int = 0) -> dict[str, Any]:
     """Evaluate a checkpoint of `run_dir`: "last", "best" or its env steps. Statistics per seed and over all."""
     program = build(config)
-    checkpoints = Checkpoints(run_dir)
-    try:
-        step = _choose(checkpoints, run_dir, checkpoint)
-        check_compatible(checkpoints.config(step), program.config, source=run_dir)
-        state = checkpoints.restore(step, jax.eval_shape(program.init, seed_keys(program)))
-    finally:
-        checkpoints.close()
-    keys = evaluation_keys(program, seed, stream=_AFTERWARDS)
+    step, state = load_checkpoint(program, run_dir, checkpoint)
+    keys = evaluation_keys(program, seed, stream=AFTERWARDS)
     episodes = jax.device_get(program.evaluate(state, keys))
     per_seed = [
         {"seed": name} | evaluation.summarise(jax.tree.map(lambda x, i=i: x[i], episodes))
@@ -138,6 +133,17 @@ def evaluate(config: Config, run_dir: Path, *, checkpoint: str = "last", seed: i
     ]
     about = {"run": str(run_dir), "env": config.env.name, "engine": program.config.env.engine, "env_steps": step}
     return about | evaluation.summarise(episodes) | {"seeds": per_seed}
+
+
+def load_checkpoint(program: Program, run_dir: Path, wanted: str) -> tuple[int, TrainState]:
+    """(env steps, state of all seeds) of a checkpoint of `run_dir`: "last", "best" or its env steps."""
+    checkpoints = Checkpoints(run_dir)
+    try:
+        step = _choose(checkpoints, run_dir, wanted)
+        check_compatible(checkpoints.config(step), program.config, source=run_dir)
+        return step, checkpoints.restore(step, jax.eval_shape(program.init, seed_keys(program)))
+    finally:
+        checkpoints.close()
 
 
 def evaluation_keys(program: Program, number: int, *, stream: int = _DURING_TRAINING) -> jax.Array:
@@ -271,15 +277,18 @@ def _prepare(run_dir: Path, config: Config) -> None:
 
 
 def _resolve(config: Config, engine: str, spec: Spec) -> Config:
-    """`config` with the engine and the initial cuts that are really used."""
+    """`config` with the engine, the map and the initial cuts that are really used."""
     values = config.model_dump(mode="json")
     values["env"]["engine"] = engine
+    if "map" in values["env"]["options"]:  # the run must not change with the file
+        values["env"]["options"]["map"] = arena.load(values["env"]["options"]["map"])
     if values["abstraction"]["cuts"] is None:
         values["abstraction"]["cuts"] = spec.region_cuts
     return parse(values)
 
 
-def _make_env(config: Config, goals: str) -> Any:
+def make_env(config: Config, goals: str) -> Any:
+    """The task of `config`: with "test" on its test goals, with "train" on those that the options name, if any."""
     options = {"goals": goals} | config.env.options if goals == "train" else config.env.options | {"goals": goals}
     try:
         return envs.make(config.env.name, engine=config.env.engine, **options)

@@ -21,6 +21,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "point.yaml").write_text("env: {name: point_maze}\ntrainer: {num_envs: 8}\n")
     (tmp_path / "ant.yaml").write_text("env: {name: ant_maze}\ntrainer: {num_envs: 8}\n")
+    (tmp_path / "old.png").write_text("precious")
     (tmp_path / "broken.yaml").write_text("tutor:\n  period: [5\ntrainer: {}\n")
     run = tmp_path / "runs" / "old"
     run.mkdir(parents=True)
@@ -97,6 +98,19 @@ def refusal(capsys, folder, arguments):
         pytest.param("evaluate", "required: run", id="evaluate nothing"),
         pytest.param("evaluate runs/old --episodes x", "trainer.eval_episodes: 'x'", id="episodes not a number"),
         pytest.param("evaluate runs/old --evaluation-seed x", "--evaluation-seed", id="seed not a number"),
+        pytest.param("render", "required: --out", id="render nothing"),
+        pytest.param("render --out a.png", "give a task, or --run RUN", id="render neither task nor run"),
+        pytest.param("render point_maze --out a.avi", "a.avi: cannot tell what to write", id="render an odd ending"),
+        pytest.param("render point_maze --out a/b.png", "there is no folder a", id="render into no folder"),
+        pytest.param("render point_maze --out runs", "runs: is a folder", id="render over a folder"),
+        pytest.param("render point_maze --out old.png", "old.png: exists; replace it with --force", id="render over"),
+        pytest.param("render point_maze --out a.png --seed 1", "--seed: needs --run", id="render seed without run"),
+        pytest.param("render point_maze --out a.png --checkpoint best", "--checkpoint: needs --run", id="no run"),
+        pytest.param("render point_maze --out a.png --tutor.period 5", "--tutor.period: random", id="render settings"),
+        pytest.param("render point_maze --out a.gif --envs 26", "from 1 to 25", id="render too many"),
+        pytest.param("render point_maze --out a.gif --every 0", "from 1 to", id="render every 0th"),
+        pytest.param("render point_maze --out a.gif --camera folow", "choose from", id="render unknown camera"),
+        pytest.param("render --run runs/new --out a.gif", "runs/new: is not a run directory", id="render a non-run"),
         pytest.param("settings tutr", "tutr: no setting begins so", id="unknown prefix"),
         pytest.param("settings --tutor.period=5", "takes no settings", id="settings with a setting"),
         pytest.param("envs --tutor.period 5", "takes no settings", id="envs with a setting"),
@@ -232,7 +246,7 @@ def test_help_shows_how_to_train_resume_and_evaluate(capsys, arguments):
         code = end.code
     out, err = capsys.readouterr()
     assert (code, err) == (0, "")
-    for text in ("star train configs/", "--resume", "star evaluate", "star envs", "star settings"):
+    for text in ("star train configs/", "--resume", "star evaluate", "star render", "star envs", "star settings"):
         assert text in out
 
 

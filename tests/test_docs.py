@@ -7,8 +7,8 @@ from pathlib import Path
 import jax
 import pytest
 
-import envs
-from star import trainer
+from envs.tasks import TASKS
+from star import cli, rendering, trainer
 from star.cli import main
 from star.config import Config, fields, parse
 
@@ -58,6 +58,8 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
     report = {"env": "", "engine": "", "env_steps": 0, "seeds": []}
     monkeypatch.setattr(trainer, "evaluate", lambda config, run_dir, **_: report)
+    monkeypatch.setattr(cli, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg
+    monkeypatch.setattr(rendering, "render", lambda config, show, **_: "")
     return tmp_path
 
 
@@ -72,7 +74,7 @@ def test_every_command_line_of_the_pages_is_accepted(words, folder):
 def test_the_pages_show_how_to_train_resume_evaluate_and_look_things_up():
     shown = {tuple(one.values[0][1:3]) for one in STAR}
     assert ("train", "configs/point_maze.yaml") in shown and ("train", "--resume") in shown
-    assert {"train", "evaluate", "settings", "envs"} == {words[0] for words in shown}
+    assert {"train", "evaluate", "render", "settings", "envs"} == {words[0] for words in shown}
 
 
 @pytest.mark.parametrize("words", MAKE)
@@ -129,7 +131,7 @@ def test_departures_name_the_settings_and_their_defaults():
     assert len(table) >= 20
     for key, published, ours, _ in table:
         if key.startswith("env.options."):
-            default = envs.tasks.ANT_OPTIONS[key.removeprefix("env.options.")].default
+            default = TASKS["ant_maze"].options()[key.removeprefix("env.options.")].default
         else:
             default = DEFAULTS[key]
         assert ours == f"`{json.dumps(default)}`", key

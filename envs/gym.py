@@ -1,0 +1,333 @@
+"""The tasks as Gymnasium environments, one at a time or as a batch. `envs.registration` gives them their ids.
+
+    observation = observation: state, achieved_goal: its entries that the goal fixes, desired_goal
+    reward      = compute_reward(achieved_goal, desired_goal, info)
+    info        = distance (m), is_success, fault
+
+Both kinds run a `VectorEnv` through two compiled functions, which all environments of the same task, options and
+number share. After each call one array goes to the host, a record [B, n + 3]: observation [n], then done, truncation
+and fault as 0 or 1.
+
+Distance, success and reward are computed on the host from the observation. Computed along with the step they could
+differ in the last bit from what `compute_reward` makes of the same goals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box, Dict
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+import envs
+from envs.arena import Arena
+from envs.maze import MazeEnv
+
+Observation = dict[str, np.ndarray]
+Info = dict[str, Any]
+
+RENDER_MODE = "rgb_array"
+LARGEST = np.finfo(np.float32).max  # observations are finite, and nothing more is known of them
+PROGRAMS = 16  # that are kept compiled
+
+
+class Program(NamedTuple):
+    """The compiled functions of a batch of B environments. Both return the new state and a record of it.
+
+    `step` takes a state and actions [B, action_size]; `begin` a state, a mask (bool [B]) of the environments that
+    begin an episode, and 64 random bits (uint32 [2]). `blank` is a state to begin from.
+    """
+
+    env: MazeEnv
+    blank: Any
+    begin: Callable[[Any, np.ndarray, np.ndarray], tuple[Any, Any]]
+    step: Callable[[Any, np.ndarray], tuple[Any, Any]]
+
+
+class Record(NamedTuple):
+    """A record on the host: observations [B, n] and three flags (bool [B])."""
+
+    obs: np.ndarray
+    done: np.ndarray
+    truncated: np.ndarray
+    fault: np.ndarray
+
+
+class GymEnv(gymnasium.Env[Observation, np.ndarray]):
+    """One environment. `maze` is the `MazeEnv` that it runs.
+
+    An episode is truncated after `episode_length` steps, and by a fault of the simulator, which sets `info["fault"]`.
+    It is terminated only if an option of the task asks for that.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": [RENDER_MODE], "render_fps": 10}
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        camera: str = "follow",
+        **options: Any,
+    ):
+        """Make `task` with the options of `envs.make`; pictures are `width` by `height` pixels from `camera`.
+
+        Raises:
+          EnvError: in one line, if a name or value is wrong, or the engine cannot run here.
+        """
+        self._program = program(task, options, 1)
+        self.maze = self._program.env
+        self.observation_space, self.action_space = spaces(self.maze)
+        self.metadata = self.metadata | {"render_fps": max(round(1 / self.maze.dt), 1)}
+        self.render_mode = _checked_mode(render_mode)
+        self._picture = {"width": width, "height": height, "camera": camera}
+        self._state: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
+        """Begin an episode. The same seed gives the same start and goal, and so do those drawn from it later."""
+        super().reset(seed=seed)
+        everyone = np.ones(1, bool)
+        self._state, array = self._program.begin(self._program.blank, everyone, _bits(self.np_random))
+        record = _read(self.maze, array)
+        return _first(goals(self.maze, record.obs)), _first(_info(self.maze, record.obs))
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, Info]:
+        """One env step; `action` [action_size] is clipped to [-1, 1]."""
+        action = _checked_action(action, self.action_space)[None]
+        self._state, array = self._program.step(_started(self._state), action)
+        record = _read(self.maze, array)
+        observation = goals(self.maze, record.obs)
+        reward = compute_reward(self.maze, observation["achieved_goal"], observation["desired_goal"])
+        (truncated,), (done,) = record.truncated.tolist(), record.done.tolist()
+        info = _first(_info(self.maze, record.obs, record.fault))
+        return _first(observation), reward.item(), done and not truncated, truncated, info
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+        """The reward [...] for goals [..., k], to the bit that of a step that ends in them. `info` is not used."""
+        return compute_reward(self.maze, achieved_goal, desired_goal)
+
+    def render(self) -> Any:
+        """A picture, uint8 [height, width, 3], with `render_mode="rgb_array"`; else nothing."""
+        if self.render_mode is None:
+            return _nothing_to_render()
+        return _picture(self.maze, _started(self._state), 0, self._picture)
+
+
+class GymVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarray]):
+    """`num_envs` (B) environments in one batch. One that ends begins its next episode within the same step.
+
+    Observation and info are then those of the new episode, `infos["final_obs"]` and `infos["final_info"]` those of
+    the step that ended the last one.
+    """
+
+    metadata: dict[str, Any] = GymEnv.metadata | {"autoreset_mode": AutoresetMode.SAME_STEP}
+
+    def __init__(
+        self,
+        task: str,
+        num_envs: int = 1,
+        *,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        camera: str = "follow",
+        **options: Any,
+    ):
+        """Make a batch of `task`; all else as for `GymEnv`."""
+        if type(num_envs) is not int or num_envs < 1:
+            raise envs.EnvError(f"num_envs is {num_envs!r}; allowed: a whole number above 0")
+        self._program = program(task, options, num_envs)
+        self.maze = self._program.env
+        self.num_envs = num_envs
+        self.single_observation_space, self.single_action_space = spaces(self.maze)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.metadata = self.metadata | {"render_fps": max(round(1 / self.maze.dt), 1)}
+        self.render_mode = _checked_mode(render_mode)
+        self._picture = {"width": width, "height": height, "camera": camera}
+        self._state: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
+        """Begin all episodes, or those of `options["reset_mask"]` (bool [B]) alone."""
+        super().reset(seed=seed)
+        mask = (options or {}).get("reset_mask")
+        if mask is None:
+            before, mask = self._program.blank, np.ones(self.num_envs, bool)
+        else:
+            before, mask = _started(self._state), _checked_mask(mask, self.num_envs)
+        obs = self._begin(before, mask)
+        return goals(self.maze, obs), _masked(_info(self.maze, obs), mask)
+
+    def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Info]:
+        """One env step of every environment; `actions` [B, action_size] are clipped to [-1, 1]."""
+        actions = _checked_action(actions, self.action_space)
+        self._state, array = self._program.step(_started(self._state), actions)
+        record, everyone = _read(self.maze, array), np.ones(self.num_envs, bool)
+        reached, done = goals(self.maze, record.obs), record.done
+        rewards = compute_reward(self.maze, reached["achieved_goal"], reached["desired_goal"]).astype(np.float64)
+        flags = (done & ~record.truncated, record.truncated)
+        infos = _info(self.maze, record.obs, record.fault)
+        if not done.any():
+            return reached, rewards, *flags, _masked(infos, everyone)
+        final: Info = {"final_obs": _each(reached, done), "_final_obs": done.copy()}
+        final |= {"final_info": _masked(infos, done), "_final_info": done.copy()}
+        obs = self._begin(self._state, done)
+        infos = _masked(_info(self.maze, obs, record.fault & ~done), everyone)
+        return goals(self.maze, obs), rewards, *flags, infos | final
+
+    def _begin(self, state: Any, mask: np.ndarray) -> np.ndarray:
+        """Begin new episodes where the mask says so; returns all observations [B, n]."""
+        self._state, array = self._program.begin(state, mask, _bits(self.np_random))
+        return _read(self.maze, array).obs
+
+    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+        """The reward [...] for goals [..., k], to the bit that of a step that ends in them. `info` is not used."""
+        return compute_reward(self.maze, achieved_goal, desired_goal)
+
+    def render(self) -> Any:
+        """A picture of each environment, uint8 [height, width, 3], with `render_mode="rgb_array"`; else nothing."""
+        if self.render_mode is None:
+            return _nothing_to_render()
+        state = _started(self._state)
+        return tuple(_picture(self.maze, state, i, self._picture) for i in range(self.num_envs))
+
+
+def program(task: str, options: dict[str, Any], num_envs: int) -> Program:
+    """The program of a batch, compiled at most once; raises `EnvError` if the options are wrong."""
+    arena = envs.make(task, **options).arena  # the file of a map may have changed
+    return _compiled(task, arena, num_envs, **dict(sorted(options.items())))
+
+
+@lru_cache(maxsize=PROGRAMS)
+def _compiled(task: str, arena: Arena, num_envs: int, **options: Any) -> Program:
+    env = envs.make(task, **options)
+    vector = envs.VectorEnv(env, num_envs, auto_reset=False)
+
+    def begin(state: Any, mask: jax.Array, bits: jax.Array) -> tuple[Any, jax.Array]:
+        return recorded(vector.reset_where(state, mask, key(bits)))
+
+    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
+        return recorded(vector.step(state, action))
+
+    def key(bits: jax.Array) -> jax.Array:
+        return jax.random.wrap_key_data(bits, impl="threefry2x32")
+
+    def recorded(state: Any) -> tuple[Any, jax.Array]:
+        fault = jnp.maximum(state.metrics["non_finite"], state.metrics["overflow"])
+        flags = jnp.stack([state.done, state.info["truncation"], fault], axis=-1)
+        return state, jnp.concatenate([state.obs, flags], axis=-1)
+
+    shapes = jax.eval_shape(lambda bits: vector.reset(key(bits)), jax.ShapeDtypeStruct((2,), jnp.uint32))
+    blank = jax.jit(lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
+    return Program(env=env, blank=blank(), begin=jax.jit(begin), step=jax.jit(step))
+
+
+def spaces(env: MazeEnv) -> tuple[gymnasium.Space[Any], Box]:
+    """The spaces of one environment's observations and actions."""
+    goal = len(env.goal_indices)
+    sizes = {"observation": env.state_dim, "achieved_goal": goal, "desired_goal": goal}
+    observations = Dict({name: Box(-LARGEST, LARGEST, (size,), np.float32) for name, size in sizes.items()})
+    return observations, Box(-1.0, 1.0, (env.action_size,), np.float32)
+
+
+def goals(env: MazeEnv, obs: np.ndarray) -> Observation:
+    """Gymnasium's dictionary of observations [..., n], in arrays of their own."""
+    return {
+        "observation": obs[..., : env.state_dim].copy(),
+        "achieved_goal": obs[..., list(env.goal_indices)],
+        "desired_goal": obs[..., env.state_dim :].copy(),
+    }
+
+
+def compute_reward(env: MazeEnv, achieved: np.ndarray, desired: np.ndarray) -> Any:
+    """The reward [...] for goals [..., k]. One pair of goals is rewarded as a batch of one: NumPy rounds alike."""
+    achieved, desired = np.asarray(achieved), np.asarray(desired)
+    pairs = (goal.reshape(-1, len(env.goal_indices)) for goal in (achieved, desired))
+    return env.reward(*pairs).reshape(achieved.shape[:-1])[()]
+
+
+def _info(env: MazeEnv, obs: np.ndarray, fault: np.ndarray | None = None) -> Info:
+    """Info of a batch, each value [B]; no fault unless given."""
+    offset = obs[:, list(env.goal_indices)] - obs[:, env.state_dim :]
+    distance = np.sqrt(np.square(offset).sum(axis=-1))
+    return {
+        "distance": distance.astype(np.float64),
+        "is_success": distance < env.success_radius,
+        "fault": np.zeros(len(obs), bool) if fault is None else fault,
+    }
+
+
+def _first(batch: dict[str, Any]) -> dict[str, Any]:
+    """The first of a batch; numbers become Python's."""
+    return {key: value[0] if value.ndim > 1 else value[0].item() for key, value in batch.items()}
+
+
+def _each(batch: Observation, mask: np.ndarray) -> np.ndarray:
+    """An array [B] of one dictionary for each environment of the mask, None for the others."""
+    found = np.full(len(mask), None, object)
+    for i in np.flatnonzero(mask):
+        found[i] = {key: value[i].copy() for key, value in batch.items()}
+    return found
+
+
+def _masked(info: Info, mask: np.ndarray) -> Info:
+    """Info as Gymnasium's vector environments give it: 0 outside of the mask, and the mask under `_key`."""
+    values = {key: np.where(mask, value, np.zeros_like(value)) for key, value in info.items()}
+    return values | {f"_{key}": mask.copy() for key in info}
+
+
+def _bits(generator: np.random.Generator) -> np.ndarray:
+    return generator.integers(2**32, size=2, dtype=np.uint32)
+
+
+def _read(env: MazeEnv, array: jax.Array) -> Record:
+    host = np.asarray(array)
+    done, truncated, fault = host[:, env.observation_size :].T > 0
+    return Record(host[:, : env.observation_size], done, truncated, fault)
+
+
+def _checked_action(action: Any, space: gymnasium.Space[Any]) -> np.ndarray:
+    action = np.asarray(action, np.float32)
+    if action.shape != space.shape:
+        raise ValueError(f"the shape of an action is {action.shape}; allowed: {space.shape}")
+    return action
+
+
+def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:
+    if not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.shape != (num_envs,) or not mask.any():
+        raise ValueError(f"reset_mask is {mask!r}; allowed: a NumPy array of {num_envs} bool, one of them true")
+    return mask
+
+
+def _checked_mode(mode: str | None) -> str | None:
+    if mode not in (None, RENDER_MODE):
+        raise envs.EnvError(f'render_mode is {mode!r}; allowed: None, "{RENDER_MODE}"')
+    return mode
+
+
+def _started(state: Any) -> Any:
+    if state is None:
+        raise ResetNeeded("the environment has not been reset")
+    return state
+
+
+def _nothing_to_render() -> None:
+    gymnasium.logger.warn(f'nothing is rendered: make the environment with render_mode="{RENDER_MODE}"')
+
+
+def _picture(env: MazeEnv, state: Any, i: int, picture: dict[str, Any]) -> np.ndarray:
+    from envs import render
+
+    goal = np.asarray(state.obs[i, env.state_dim :])
+    data = jax.tree.map(lambda leaf: leaf[i], state.pipeline_state.data)
+    return render.frame(env, data, marks=render.Marks(goal=goal), **picture)

@@ -1,0 +1,251 @@
+"""Pictures of episodes: what is recorded is what happened, and what is asked for is drawn."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import envs
+from envs import EnvError, opengl
+from star import cli, rendering, trainer
+from star.checkpoint import Checkpoints
+from star.config import ConfigError, parse
+from star.rendering import Moments, Show
+
+ROOT = Path(__file__).parents[1]
+EPISODE = 40
+TINY = {
+    "env": {"name": "point_maze", "engine": "jax", "options": {"episode_length": EPISODE}},
+    "commander": {"period": 20},
+    "tutor": {"unroll": 2, "ppo": {"hidden": [8], "minibatches": 1}},
+    "controller": {"ppo": {"hidden": [8], "minibatches": 1}},
+    "abstraction": {"max_regions": 8},
+    "forward_model": {"hidden": [8], "buffer_size": 64, "batch_size": 8},
+    "trainer": {"num_envs": 4, "eval_episodes": 3, "num_seeds": 2, "seed": 5},
+}
+
+
+@pytest.fixture
+def can_draw():
+    try:
+        opengl.backend()
+    except EnvError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run directory with one checkpoint of agents that have learnt nothing, of the seeds 5 and 6."""
+    run_dir = tmp_path_factory.mktemp("runs") / "new"
+    run_dir.mkdir()
+    program = trainer.build(parse(TINY))
+    (run_dir / "config.yaml").write_text(program.config.to_yaml())
+    checkpoints = Checkpoints(run_dir)
+    checkpoints.save(160, program.init(trainer.seed_keys(program)), program.config, success=0.0)
+    checkpoints.close()
+    return run_dir
+
+
+@pytest.fixture(scope="module")
+def recorded(run):
+    """Three environments of the second agent, and what `trainer.evaluate` says of the same episodes."""
+    config = parse(TINY)
+    recording = rendering.record_run(config, run, checkpoint="last", agent=6, envs=3, steps=None, seed=1)
+    _, row = trainer.evaluate(config, run, seed=1)["seeds"]
+    return SimpleNamespace(recording=recording, row=row)
+
+
+def random_actions(*, seed):
+    config = parse({"env": {"name": "point_maze"}})
+    return rendering.record_random(config, envs=6, steps=4, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def wander():
+    """Four env steps of random actions in six environments."""
+    return random_actions(seed=3)
+
+
+def first(recording, count):
+    """Only the first `count` environments."""
+    kept = {name: leaf[:, :count] for name, leaf in vars(recording.moments).items() if leaf is not None}
+    return rendering.Recording(recording.env, Moments(**kept), recording.regions)
+
+
+def test_the_recorded_episodes_are_those_that_are_evaluated(recorded):
+    moments = recorded.recording.moments
+    assert recorded.row["seed"] == 6
+    assert moments.distance[-1].mean() == pytest.approx(recorded.row["distance"], rel=1e-5)
+    assert (moments.success.max(axis=0) > 0).mean() == recorded.row["success_any"]
+
+
+def test_an_episode_is_recorded_from_its_start_to_its_end(recorded):
+    moments = recorded.recording.moments
+    assert moments.obs.shape[:2] == moments.qpos.shape[:2] == (EPISODE + 1, 3)
+    np.testing.assert_array_equal(moments.qpos, moments.obs[..., :2])
+    assert (np.abs(moments.obs[0, :, :2]) <= 0.1).all()
+    goal = moments.obs[..., 4:]
+    np.testing.assert_array_equal(goal, np.broadcast_to([0.0, 16.0], goal.shape))
+    np.testing.assert_allclose(moments.distance, np.linalg.norm(moments.obs[..., :2] - goal, axis=-1), rtol=1e-5)
+
+
+def test_a_subgoal_stays_where_it_is_until_the_next_decision(recorded):
+    subgoal = recorded.recording.moments.subgoal
+    period = 10
+    for t in range(EPISODE):
+        if t % period:
+            np.testing.assert_allclose(subgoal[t], subgoal[t - 1], atol=1e-4)
+    assert (np.abs(subgoal[period] - subgoal[period - 1]) > 1e-3).any()
+
+
+def test_the_target_is_a_region_or_the_surroundings_of_the_goal(recorded):
+    recording = recorded.recording
+    known = {tuple(np.concatenate(box)) for box in zip(*recording.regions, strict=True)} | {(-1.0, 15.0, 1.0, 17.0)}
+    boxes = np.concatenate([recording.moments.lower, recording.moments.upper], axis=-1)
+    assert {tuple(box) for box in boxes.reshape(-1, 4)} <= known
+
+
+def test_random_actions_differ_between_seeds_and_environments(wander):
+    obs = wander.moments.obs
+    assert obs.shape[:2] == (5, 6)
+    assert (obs != random_actions(seed=4).moments.obs).any() and (obs[:, 0] != obs[:, 1]).any()
+
+
+def test_after_its_end_an_environment_stays_as_it_was():
+    qpos = np.arange(12.0).reshape(6, 2, 1)
+    qpos[3:, 0] = np.nan  # the simulation of the first breaks
+    done = np.zeros((6, 2))
+    done[3:, 0] = 1.0
+    done[2:, 1] = 1.0  # the second turns over
+    leaves = {name: qpos for name in ("mocap_pos", "obs", "distance", "success")}
+    whole = Moments(qpos=qpos, done=done, **leaves)
+    parts = [Moments(**{k: v[i] for k, v in vars(whole).items() if v is not None}) for i in (slice(5), 5)]
+    joined = rendering._joined(*parts)
+    np.testing.assert_array_equal(joined.qpos[:, 0, 0], [0, 2, 4, 4, 4, 4])
+    np.testing.assert_array_equal(joined.qpos[:, 1, 0], [1, 3, 5, 5, 5, 5])
+
+
+@pytest.mark.parametrize(
+    ("out", "every", "total", "shown"),
+    [
+        ("a.png", 2, 11, [10]),
+        ("a.gif", 1, 4, [0, 1, 2, 3]),
+        ("a.gif", 3, 10, [0, 3, 6, 9]),
+        ("a.html", 4, 11, [0, 4, 8, 10]),
+        ("a.mp4", 100, 11, [0, 10]),
+    ],
+)
+def test_a_still_shows_the_end_and_a_film_every_nth_moment_and_the_end(out, every, total, shown):
+    assert rendering.moments_shown(total, Show(out=Path(out), every=every)) == shown
+
+
+@pytest.mark.parametrize(("count", "across", "down"), [(1, 1, 1), (2, 1, 2), (4, 2, 2), (6, 3, 2)])
+def test_environments_stand_side_by_side(can_draw, wander, count, across, down):
+    show = Show(out=Path("a.gif"), height=60)
+    one, many = (next(rendering.draw(first(wander, n), show, [4])) for n in (1, count))
+    assert many.shape == (down * one.shape[0], across * one.shape[1], 3)
+    if count == 2:
+        above, below = np.split(many, 2)
+        assert (above != below).any()
+
+
+def test_a_film_of_an_agent_shows_that_it_moves_and_where_it_is_going(can_draw, run, recorded):
+    recording = recorded.recording
+    show = Show(out=Path("a.gif"), height=100)
+    start, end = rendering.draw(recording, show, [0, EPISODE])
+    assert (start != end).any()
+    without = rendering.Recording(recording.env, recording.moments.replace(subgoal=None, lower=None, upper=None))
+    assert (next(rendering.draw(without, show, [EPISODE])) != end).any()
+
+
+def test_the_command_draws_a_task_and_the_same_picture_again(can_draw, tmp_path, capsys):
+    out = tmp_path / "maze.png"
+    arguments = "render ant_maze --steps 2 --height 120 --env.options.goals test --env.engine native".split()
+    assert cli.main([*arguments, "--out", str(out)]) == 0
+    said, errors = capsys.readouterr()
+    assert said == f"{out}: 1 picture; the goal is not reached\n" and errors == ""
+    before = out.read_bytes()
+    assert cli.main([*arguments, "--out", str(out)]) == 2
+    assert "exists; replace it with --force" in capsys.readouterr().err
+    assert cli.main([*arguments, "--out", str(out), "--force"]) == 0
+    assert out.read_bytes() == before
+    assert np.asarray(Image.open(out).convert("RGB")).std() > 10
+
+
+def test_the_command_draws_an_agent(can_draw, run, recorded, tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def record(config, run_dir, **how):
+        asked.append((config.env.name, run_dir, how))
+        return first(recorded.recording, how["envs"])
+
+    monkeypatch.setattr(rendering, "record_run", record)
+    out = tmp_path / "agent.gif"
+    arguments = f"render --run {run} --out {out} --seed 6 --checkpoint 160 --evaluation-seed 9 --envs 2 --every 10"
+    assert cli.main([*arguments.split(), "--height", "60"]) == 0
+    how = {"checkpoint": "160", "agent": 6, "envs": 2, "steps": None, "seed": 9}
+    assert asked == [("point_maze", run, how)]
+    assert capsys.readouterr().out.startswith(f"{out}: 5 pictures; ")
+    with Image.open(out) as film:
+        assert film.n_frames == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("point_mase", 'env: task "point_mase" is unknown'),
+        ("point_maze --env.options.gaols test", 'option "gaols"'),
+        ("point_maze --steps 501", "--steps: 501 is more than the 500 env steps of an episode"),
+        ("--run RUN --seed 7", "--seed: 7 is not among those of"),
+        ("--run RUN --checkpoint 7", "--checkpoint: '7' is not among last, best, 160"),
+        ("ant_maze --run RUN", "its agent was trained on point_maze, not on ant_maze"),
+        ("--run RUN --tutor.ppo.hidden [16]", "its checkpoint was made with tutor.ppo.hidden"),
+        ("--run RUN --steps 41", "--steps: 41 is more than the 40 env steps"),
+    ],
+)
+def test_what_cannot_be_drawn_is_told_in_one_line_and_nothing_is_written(
+    run, tmp_path, monkeypatch, capsys, arguments, said
+):
+    monkeypatch.setattr(opengl, "backend", lambda: None)
+    words = ["render", *arguments.replace("RUN", str(run)).split(), "--out", str(tmp_path / "a.png")]
+    assert cli.main(words) == 2
+    out, err = capsys.readouterr()
+    assert said in err and err.count("\n") == 1 and out == "" and not list(tmp_path.iterdir())
+
+
+def test_without_opengl_the_command_says_so_before_anything_is_recorded(tmp_path, monkeypatch, capsys):
+    def nothing_works():
+        raise EnvError("pictures need OpenGL")
+
+    monkeypatch.setattr(opengl, "backend", nothing_works)
+    monkeypatch.setattr(rendering, "record_random", None)
+    assert cli.main(["render", "point_maze", "--out", str(tmp_path / "a.png")]) == 2
+    assert capsys.readouterr().err == "error: pictures need OpenGL\n"
+
+
+def test_a_broken_driver_does_not_end_in_a_traceback(tmp_path):
+    environment = os.environ | {"MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "egl", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "star.cli", "render", "point_maze", "--out", str(tmp_path / "a.png")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: pictures need OpenGL") and done.stderr.count("\n") == 1
+
+
+def test_an_error_while_recording_becomes_one_of_the_configuration(tmp_path):
+    with pytest.raises(ConfigError, match="unknown"):
+        rendering.render(parse({"env": {"name": "nowhere"}}), Show(out=tmp_path / "a.png"), quiet=True)
+
+
+def test_the_gallery_shows_every_task_and_is_small():
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    images = ROOT / "docs" / "images"
+    for name in envs.names():
+        assert f"](images/{name}.jpg)" in page and (images / f"{name}.jpg").is_file(), "run scripts/make_gallery.py"
+    assert sum(path.stat().st_size for path in images.iterdir()) < 1.5e6
