@@ -1,8 +1,9 @@
-"""What all tests share: JAX on the CPU, hypothesis without deadlines, and a tiny hierarchy, recorded step by step."""
+"""What all tests share: JAX on the CPU, quickly compiled, hypothesis without deadlines, and a tiny hierarchy, recorded step by step."""
 
 import os
 
 os.environ["JAX_PLATFORMS"] = "cpu"
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # compilation is most of what tests cost
 
 from types import SimpleNamespace  # noqa: E402
 
@@ -14,6 +15,7 @@ from hypothesis import settings  # noqa: E402
 
 import envs  # noqa: E402
 import star.state  # noqa: E402
+from envs import opengl  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
 from star import config, episode, hierarchy  # noqa: E402
@@ -65,6 +67,15 @@ class Fused:
 
     def dropped(self, data):
         return jnp.zeros((), bool)
+
+
+@pytest.fixture(scope="session")
+def can_draw():
+    """Skips the test where no OpenGL loads."""
+    try:
+        opengl.backend()
+    except envs.EnvError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="session")

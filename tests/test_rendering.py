@@ -32,14 +32,6 @@ TINY = {
 }
 
 
-@pytest.fixture
-def can_draw():
-    try:
-        opengl.backend()
-    except EnvError as error:
-        pytest.skip(str(error))
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A run directory with one checkpoint of agents that have learnt nothing, of the seeds 5 and 6."""

@@ -69,8 +69,9 @@ def painted(monkeypatch):
     """Calls of `render.frame`, which then draws nothing."""
     calls = []
 
-    def frame(env, data, *, width, height, camera="follow"):
+    def frame(env, data, *, width, height, camera="follow", marks=render.NOTHING):
         calls.append((env, data, camera))
+        assert len(marks.goal) == len(env.goal_indices)
         return np.zeros((height, width, 3), np.uint8)
 
     monkeypatch.setattr(render, "frame", frame)

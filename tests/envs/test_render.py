@@ -9,19 +9,14 @@ import numpy as np
 import pytest
 
 import envs
-from envs import EnvError, opengl, render
+from envs import EnvError, render
 from envs.render import Marks, Painter, Stage
 
 ROOT = Path(__file__).parents[2]
 SIZE = {"width": 120, "height": 90}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def can_draw():
-    try:
-        opengl.backend()
-    except EnvError as error:
-        pytest.skip(str(error))
+pytestmark = pytest.mark.usefixtures("can_draw")
 
 
 @pytest.fixture(scope="module")
