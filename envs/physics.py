@@ -31,7 +31,7 @@ from envs.options import EnvError
 
 CONTACTS = 24  # per environment; MJX-Warp pools them over the batch
 CONSTRAINT_ROWS = 96  # per environment, MJX-Warp
-BLOCK_CONTACTS = 16  # more of them for each block, with 4 rows each
+SLIDE_CONTACTS = 8  # more of them for each slide joint, with 4 rows each
 MIN_POOL = 512  # contacts of a batch, however small
 OVERFLOW_BITS = 0b111111  # buffers of MJX-Warp that were too small: constraint rows, contacts, convex collisions
 
@@ -180,9 +180,9 @@ def _warp(model: mujoco.MjModel, frames: int) -> StepBatch:
     warp.config.log_level = warp.LOG_WARNING  # it would report every kernel that it compiles
     device_model = mjx.put_model(model, impl="warp").tree_replace({"opt._impl.warn_overflow": 0})
 
-    blocks = int(((model.geom_contype > 0) & (model.geom_conaffinity > 0)).sum())  # they meet everything
-    contacts = CONTACTS + blocks * BLOCK_CONTACTS
-    rows = CONSTRAINT_ROWS + blocks * 4 * BLOCK_CONTACTS
+    slides = int((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE).sum())
+    contacts = CONTACTS + slides * SLIDE_CONTACTS
+    rows = CONSTRAINT_ROWS + slides * 4 * SLIDE_CONTACTS
 
     def overflow(full: mjx.Data) -> jax.Array:
         return ((full._impl.overflow & OVERFLOW_BITS) != 0).astype(jnp.float32)

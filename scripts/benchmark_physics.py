@@ -8,7 +8,8 @@ For each task, engine and number of environments, by turns:
     full    the environment's loop: action, physics, observation, reward, success, resets spread over all steps
 
 `ratio` is full / bare, the median over `--repeats` pairs of loops that follow each other. `memory_per_env` is the
-device memory that the loops needed, in bytes, where JAX can tell.
+device memory that the loops needed, in bytes, where JAX can tell: it knows the peak of the process, so only a row that
+raises the peak has it.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ def main() -> None:
 
 def measure(task: str, engine: str, size: int, options: argparse.Namespace) -> dict[str, Any]:
     """The row of one task, engine and number of environments."""
+    before = peak_memory()
     env = envs.make(task, engine=engine, preset=options.preset)
     vector = envs.VectorEnv(env, size)
     state = jax.jit(vector.reset)(jax.random.key(0))
@@ -73,7 +75,7 @@ def measure(task: str, engine: str, size: int, options: argparse.Namespace) -> d
         bare_s, data = timed(bare, data, actions)
         full_s, state = timed(full, state, actions)
         pairs.append((options.steps * size / bare_s, options.steps * size / full_s))
-    memory = (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use")
+    memory = peak_memory()
     return {
         "task": task,
         "engine": env.engine,
@@ -83,12 +85,17 @@ def measure(task: str, engine: str, size: int, options: argparse.Namespace) -> d
         "full": round(statistics.median(full for _, full in pairs)),
         "ratio": round(statistics.median(full / bare for bare, full in pairs), 3),
         "ratios": [round(full / bare, 3) for bare, full in pairs],
-        "memory_per_env": memory and round(memory / size),
+        "memory_per_env": round(memory / size) if memory > before else None,
         "first_call_s": round(compile_s + more_s, 1),
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
         "python": platform.python_version(),
     }
+
+
+def peak_memory() -> int:
+    """Bytes of device memory that the process has had at most; 0 where JAX cannot tell."""
+    return (jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0)
 
 
 def loop(step: Callable[[Any, jax.Array], Any]) -> Callable[[Any, jax.Array], Any]:

@@ -15,7 +15,7 @@ For each task, from random starts and under uniform random actions:
                 env steps of `--random-steps` after which the environment had to be reset
 
 A task passes if one_step is below 1e-5 (native) or 1e-3, no p-value below .001, nothing crosses, and every ant rests.
-With `--preset fast --reference published` the two presets are compared, and one_step is only told.
+With `--preset fast --reference published` the presets are compared: one_step and the p-values are only told.
 """
 
 from __future__ import annotations
@@ -218,9 +218,10 @@ def verify(task: str, options: argparse.Namespace) -> dict[str, Any]:
     row |= {"throws": options.throws, "crossings": throws(batch, options.throws)}
     if options.random_steps:
         row |= random_steps(batch, options.random_steps)
-    tolerance = TOLERANCE[batch.env.engine] if reference == options.preset else float("inf")
-    passed = row["one_step"] < tolerance and row["crossings"] == 0 and row["rest"] > 0.1
-    passed &= min(row["p_height"], row["p_speed"], row["p_distance"]) > P_VALUE and row["contacts"] > 0
+    sound = row["crossings"] == 0 and row["rest"] > 0.1 and row["contacts"] > 0
+    alike = min(row["p_height"], row["p_speed"], row["p_distance"]) > P_VALUE
+    same = row["one_step"] < TOLERANCE[batch.env.engine]
+    passed = sound and (reference != options.preset or (alike and same))
     return row | {"passed": passed, "seconds": round(time.monotonic() - began, 1)}
 
 
