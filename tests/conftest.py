@@ -1,4 +1,4 @@
-"""What all tests share: JAX on the CPU, quickly compiled, hypothesis without deadlines, and a tiny hierarchy, recorded step by step."""
+"""What all tests share: JAX on the CPU, compiled quickly, and a tiny hierarchy, recorded step by step."""
 
 import os
 

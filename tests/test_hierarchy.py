@@ -180,6 +180,15 @@ def test_metrics_are_finite_scalars_prefixed_by_level(first):
         assert value.shape == () and np.isfinite(value), name
 
 
+def test_early_ends_are_counted_by_their_reason(first):
+    """An environment ends early at most once a segment; the fuses of the tiny environment never drop contacts."""
+    metrics = first[2]
+    for name in ("env/terminated", "env/non_finite"):
+        count = float(metrics[name])
+        assert count == round(count) and 0 < count <= B * 30 // L
+    assert float(metrics["env/overflow"]) == 0
+
+
 def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(first):
     _, end, _ = first
     items, written = jax.tree.map(np.asarray, replay.contents(end.forward_model.ring))

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -211,7 +212,7 @@ def test_ctrl_c_writes_a_checkpoint_and_says_how_to_resume(tmp_path):
     metrics = tmp_path / "run" / "metrics.jsonl"
     try:
         while process.poll() is None and not (metrics.exists() and metrics.read_text().count("\n") > 4):
-            pass
+            time.sleep(0.1)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     finally:
