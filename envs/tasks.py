@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from envs import arena as arenas
-from envs.arena import CELL_SIZES, FREE, GOAL, ROBOT, Arena
-from envs.options import Option, choice, count, duration, number
+from envs.arena import BLOCK, CELL_SIZES, CHASM, FREE, GATE, GOAL, ROBOT, Arena
+from envs.options import EnvError, Option, choice, count, duration, number
 
 Point = tuple[float, ...]
 
@@ -237,9 +237,14 @@ def own(body: str, source: str, *, cell: float | None) -> Task:
     """The row of a map of the user's own, with cells of `cell` m or else of the map's size, or 8 m.
 
     Raises:
-      EnvError: if the map is malformed.
+      EnvError: if the map is malformed, or holds what `body` can do nothing with.
     """
     arena = arenas.read(source, cell=8.0)
+    strange = {GATE: "a gate, which no map says how to open"}
+    if body == "point":
+        strange |= {BLOCK: "a block, which the point cannot push", CHASM: "a gap, which the point cannot fall into"}
+    for r, c in arena.cells("".join(strange)):
+        raise EnvError(f"map: row {r + 1}, column {c + 1} is {strange[arena.rows[r][c]]}")
     return maze(body, arena if cell is None else arenas.resized(arena, cell), maps=True)
 
 

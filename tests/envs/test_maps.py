@@ -39,6 +39,17 @@ def test_a_malformed_map_is_told_by_row_and_column(rows, words):
         assert all(word in message for word in words)
 
 
+@pytest.mark.parametrize(("symbol", "bodies"), [("D", ["point", "ant"]), ("B", ["point"]), ("#", ["point"])])
+def test_what_a_body_can_do_nothing_with_is_refused(symbol, bodies):
+    for body in ("point", "ant"):
+        rows = f"11111\n1r0{symbol}1\n11111"
+        if body in bodies:
+            with pytest.raises(envs.EnvError, match="row 2, column 4 is a "):
+                envs.make(f"{body}_maze", map=rows)
+        else:
+            assert envs.make(f"{body}_maze", map=rows, engine="native").arena.rows[1][3] == symbol
+
+
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
