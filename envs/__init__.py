@@ -9,14 +9,14 @@ imported when it is first used. Where Gymnasium is installed, its ids of the tas
 
 from __future__ import annotations
 
-import contextlib
 import importlib
+import importlib.util
 from typing import TYPE_CHECKING, Any
 
 from envs.options import EnvError
 from envs.tasks import names
 
-with contextlib.suppress(ModuleNotFoundError):
+if importlib.util.find_spec("gymnasium"):
     from envs import registration as registration
 
 if TYPE_CHECKING:

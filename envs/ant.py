@@ -154,9 +154,4 @@ class Ant:
         assert self._switch is not None
         x, y, _, w, i, j, k = data.qpos[:7]
         yaw = jnp.arctan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j**2 + k**2))
-        return at_switch(self._switch, jnp.stack([x, y])) & (self._switch.yaw[0] <= yaw) & (yaw <= self._switch.yaw[1])
-
-
-def at_switch(switch: Switch, position: jax.Array) -> jax.Array:
-    """Whether `position` [2] is where the gate opens."""
-    return ((jnp.asarray(switch.lower) <= position) & (position <= jnp.asarray(switch.upper))).all()
+        return self._switch.holds(jnp.stack([x, y])) & (self._switch.yaw[0] <= yaw) & (yaw <= self._switch.yaw[1])

@@ -12,6 +12,7 @@ floor, the floor of all others is raised by as much.
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -126,7 +127,10 @@ def read(source: str, *, cell: float) -> Arena:
     """
     source = source.strip()
     name, text = "map" if "\n" in source else f"map {source}", load(source)
-    return check(_from_yaml(text, cell, name=name) if ":" in text else Arena(_rows(text), cell), name=name)
+    return check(
+        _from_yaml(text, cell, name=name) if re.search(r"^\s*\w+\s*:", text, re.M) else Arena(_rows(text), cell),
+        name=name,
+    )
 
 
 def load(source: str) -> str:
@@ -183,6 +187,8 @@ def check(arena: Arena, *, name: str) -> Arena:
         raise EnvError(f'{name}: has no start; mark the cell of the robot with "{ROBOT}"')
     if not any(arena.cells(FREE + GOAL)):
         raise EnvError(f'{name}: has no free cell beside the start; mark free cells with "{FREE}"')
+    if any(arena.cells(BLOCK)) and "z" in arena.block and not arena.floor_height:
+        raise EnvError(f"{name}: block is {arena.block!r}, but no cell is without floor ({CHASM}) to fall into")
     reached = _walk(arena)
     for r, c in arena.cells(GOAL):
         if (r, c) not in reached:

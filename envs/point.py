@@ -78,10 +78,7 @@ class Point:
         stopped = moved.position != data.position + self.dt * velocity
         is_open = data.open
         if self._switch is not None:
-            inside = (jnp.asarray(self._switch.lower) <= moved.position) & (
-                moved.position <= jnp.asarray(self._switch.upper)
-            )
-            is_open = jnp.maximum(is_open, inside.all().astype(jnp.float32))
+            is_open = jnp.maximum(is_open, self._switch.holds(moved.position).astype(jnp.float32))
         return moved.replace(velocity=jnp.where(stopped, 0.0, velocity), open=is_open)
 
     def observe(self, data: PointState, steps: jax.Array) -> jax.Array:

@@ -80,7 +80,8 @@ class Stage:
         """(lower corner [2], upper corner [2], height of the middle) of what is of a kind, `block` or `gate`."""
         found = []
         for i in range(self.model.ngeom):
-            if self.model.geom(i).name.startswith(f"{kind}_"):
+            is_box = self.model.geom_type[i] == mujoco.mjtGeom.mjGEOM_BOX
+            if is_box and self.model.geom(i).name.startswith(f"{kind}_"):
                 centre, half = self.data.geom_xpos[i], self.model.geom_size[i]
                 found.append((centre[:2] - half[:2], centre[:2] + half[:2], float(centre[2])))
         return found

@@ -9,13 +9,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from envs import arena as arenas
 from envs.arena import BLOCK, CELL_SIZES, CHASM, FREE, GATE, GOAL, ROBOT, Arena
 from envs.options import EnvError, Option, choice, count, duration, number
 
 Point = tuple[float, ...]
 
-CLEARANCE = {"ant": 1.0, "point": 0.5}  # m that a body keeps from the sides of a cell when it starts anywhere
+CLEARANCE = {"ant": 1.0, "point": 0.6}  # m that a body keeps from the sides of a cell when it starts anywhere
 INTEGRATORS = ("implicitfast", "euler", "rk4")
 SOLVERS = ("newton", "cg")
 CONES = ("pyramidal", "elliptic")
@@ -82,6 +84,10 @@ class Switch:
     upper: Point
     yaw: tuple[float, float]
 
+    def holds(self, position: Any) -> Any:
+        """Whether `position` [2] is where the gate opens."""
+        return ((np.asarray(self.lower) <= position) & (position <= np.asarray(self.upper))).all()
+
     def resized(self, ratio: float) -> Switch:
         """The same switch at `ratio` times the size."""
         return replace(self, lower=_scaled(self.lower, ratio), upper=_scaled(self.upper, ratio))
@@ -108,15 +114,22 @@ class Task:
     maps: bool = False
 
     def resized(self, cell: float) -> Task:
-        """The task with cells of `cell` m. The success radius stays."""
-        ratio = cell / self.arena.cell
+        """The task with cells of `cell` m; heights stay."""
+        ratio, arena = cell / self.arena.cell, arenas.resized(self.arena, cell)
+        before, after = anywhere(self.body, self.arena), anywhere(self.body, arena)  # their clearance does not scale
+
+        def follow(places: Places) -> Places:
+            return after if places == before else places.resized(ratio)
+
         return replace(
             self,
-            arena=arenas.resized(self.arena, cell),
+            arena=arena,
             geometry=self.geometry.resized(ratio),
-            goals={name: places.resized(ratio) for name, places in self.goals.items()},
-            starts={name: places.resized(ratio) for name, places in self.starts.items()},
+            goals={name: follow(places) for name, places in self.goals.items()},
+            starts={name: follow(places) for name, places in self.starts.items()},
             switch=self.switch and self.switch.resized(ratio),
+            success_radius=ratio * self.success_radius,
+            block_noise=ratio * self.block_noise,
         )
 
     @property
@@ -190,6 +203,11 @@ def around(arena: Arena, symbols: str, *, clearance: float, height: Point = ()) 
     )
 
 
+def anywhere(body: str, arena: Arena) -> Places:
+    """Anywhere in the free cells, clear of their sides."""
+    return around(arena, FREE + ROBOT + GOAL, clearance=CLEARANCE[body])
+
+
 def plane(arena: Arena) -> Geometry:
     """Goals and regions over x and y: the box around the free cells, cut in the middle of both."""
     free = arena.free()
@@ -202,6 +220,11 @@ def plane(arena: Arena) -> Geometry:
         region_cuts=(((x_lo + x_hi) / 2,), ((y_lo + y_hi) / 2,)),
         subgoal_scale=(reach, reach),
     )
+
+
+def marked_goals(arena: Arena) -> Places:
+    """The centres of the cells marked `g`, else that of the free cell that is the longest walk away."""
+    return centres(arena, GOAL) if any(arena.cells(GOAL)) else point(*arenas.farthest(arena))
 
 
 def maze(
@@ -218,23 +241,24 @@ def maze(
     Training goals lie anywhere in the free cells. Test goals are the cells marked `g`, else the free cell that is
     the longest walk away. Success is within 5/8 of a cell.
     """
-    anywhere = around(arena, FREE + ROBOT + GOAL, clearance=CLEARANCE[body])
+    free = anywhere(body, arena)
     if goals is None:
-        marked = any(arena.cells(GOAL))
-        goals = {"train": anywhere, "test": centres(arena, GOAL) if marked else point(*arenas.farthest(arena))}
+        goals = {"train": free, "test": marked_goals(arena)}
     return Task(
         body=body,
         arena=arena,
         geometry=geometry or plane(arena),
         success_radius=0.625 * arena.cell if success_radius is None else success_radius,
-        goals={**goals, "free": goals.get("free", anywhere)},
-        starts={"task": centres(arena, ROBOT), "free": anywhere},
+        goals={**goals, "free": goals.get("free", free)},
+        starts={"task": centres(arena, ROBOT), "free": free},
         **columns,
     )
 
 
 def own(body: str, source: str, *, cell: float | None) -> Task:
     """The row of a map of the user's own, with cells of `cell` m or else of the map's size, or 8 m.
+
+    On a map with a gap goals lie at the centres of cells and success is within 3/8 of a cell, out of the gap's reach.
 
     Raises:
       EnvError: if the map is malformed, or holds what `body` can do nothing with.
@@ -245,7 +269,13 @@ def own(body: str, source: str, *, cell: float | None) -> Task:
         strange |= {BLOCK: "a block, which the point cannot push", CHASM: "a gap, which the point cannot fall into"}
     for r, c in arena.cells("".join(strange)):
         raise EnvError(f"map: row {r + 1}, column {c + 1} is {strange[arena.rows[r][c]]}")
-    return maze(body, arena if cell is None else arenas.resized(arena, cell), maps=True)
+    if cell is not None:
+        arena = arenas.resized(arena, cell)
+    if not arena.floor_height:
+        return maze(body, arena, maps=True)
+    goals = {"train": centres(arena, FREE + ROBOT + GOAL), "test": marked_goals(arena)}
+    goals["free"] = goals["train"]
+    return maze(body, arena, goals=goals, success_radius=0.375 * arena.cell, maps=True)
 
 
 # The published tasks (star.md of the paper's experiments): 8 m cells, success within 5 m.
@@ -277,7 +307,7 @@ CAM_SWITCH = Switch(lower=(16.0, float("-inf")), upper=(20.0, 8.0), yaw=(-1.0, 0
 FALL_GOALS = {
     "train": point(0.0, 27.0, 4.5),
     "test": point(0.0, 27.0, 4.5),
-    "free": around(FALL, FREE + ROBOT, clearance=CLEARANCE["ant"], height=(4.5,)),
+    "free": around(FALL, FREE + ROBOT, clearance=3.2, height=(4.5,)),  # nobody in the gap is within 5 m of them
 }
 FALL_GEOMETRY = Geometry(
     goal_indices=(0, 1, 2),

@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 
 import envs
+from envs.ant import MAX_TORQUE
 
 
 def main() -> None:
@@ -66,7 +67,7 @@ def measure(task: str, engine: str, size: int, options: argparse.Namespace) -> d
     actions = jax.random.uniform(jax.random.key(2), (options.steps, size, env.action_size), minval=-1.0)
     physics = jax.vmap(env.body.physics.step)
 
-    bare = loop(lambda data, action: physics(data, 30.0 * action))
+    bare = loop(lambda data, action: physics(data, MAX_TORQUE * action))
     full = loop(vector.step)
     compile_s, data = timed(bare, data, actions)
     more_s, state = timed(full, state, actions)

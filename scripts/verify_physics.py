@@ -35,7 +35,7 @@ import numpy as np
 from scipy import stats
 
 import envs
-from envs.ant import QPOS
+from envs.ant import MAX_TORQUE, QPOS
 from envs.arena import HEIGHT, Arena
 
 TOLERANCE = {"native": 1e-5, "jax": 1e-3, "warp": 1e-3}
@@ -89,7 +89,8 @@ def one_step(batch: Batch) -> dict[str, Any]:
     frames = round(batch.env.dt / batch.model.opt.timestep)
     gaps = [
         np.abs(
-            mujoco_path(batch.model, start.qpos[i], start.qvel[i], 30.0 * action[None, i], frames)[0, :-2] - after[i]
+            mujoco_path(batch.model, start.qpos[i], start.qvel[i], MAX_TORQUE * action[None, i], frames)[0, :-2]
+            - after[i]
         )
         for i in range(n)
     ]
@@ -116,7 +117,7 @@ def distributions(batch: Batch, rollouts: int, steps: int) -> dict[str, float]:
     frames = round(batch.env.dt / batch.model.opt.timestep)
 
     def plain(i: int) -> np.ndarray:
-        return summaries(mujoco_path(batch.model, start.qpos[i], start.qvel[i], 30.0 * actions[:, i], frames))
+        return summaries(mujoco_path(batch.model, start.qpos[i], start.qvel[i], MAX_TORQUE * actions[:, i], frames))
 
     with ThreadPoolExecutor() as pool:
         reference = np.array(list(pool.map(plain, range(n))))

@@ -79,7 +79,7 @@ class Display:
             self._success = success
         if self._success is not None:
             status += f"  success {self._success:.2f}"
-        faults = sum(mean(rows, key) or 0.0 for key in ("env/non_finite", "env/overflow"))
+        faults = sum(row.get(key, 0.0) for row in rows for key in ("env/non_finite", "env/overflow"))
         if faults:
             status += f"  simulator faults {faults:.0f}"
         self._progress.start_task(self._task)

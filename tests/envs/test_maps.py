@@ -1,4 +1,5 @@
 import jax
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -59,6 +60,7 @@ def test_what_a_body_can_do_nothing_with_is_refused(symbol, bodies):
         ("a.yaml", "map: |\n  111\ncell: big", ["'big'", "1.5 to 100"]),
         ("a.yaml", "map: |\n  111\ncell: .nan", ["nan", "1.5 to 100"]),
         ("a.yaml", "map: |\n  111\nblock: zz", ["'zz'", "yz"]),
+        ("a.yaml", "map: |\n  11111\n  1rB01\n  11111\nblock: yz", ["'yz'", "no cell is without floor"]),
         ("a.txt", "", ["is empty"]),
     ],
 )
@@ -104,6 +106,15 @@ def test_on_a_map_of_ones_own_goals_success_and_regions_follow_the_map():
     assert env.region_cuts == ((4.0,), (4.0,))
     assert TASKS["point_maze"].goals["test"].lower == ((0.0, 16.0),)
     assert env.reset(jax.random.key(0)).obs[-2:].tolist() == [0.0, 8.0]
+
+
+def test_on_a_map_with_a_gap_nobody_in_it_is_near_a_goal():
+    rows = "block: yz\nmap: |\n  1111\n  1r01\n  10B1\n  1##1\n  1001\n  1111"
+    env = envs.make("ant_maze", engine="native", map=rows)
+    goals = np.asarray(jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 100)).obs[:, -2:])
+    assert len(np.unique(goals, axis=0)) == 5
+    assert (np.abs(goals[:, 1] - np.clip(goals[:, 1], 12.3, 19.7)) > env.success_radius).all()
+    jax.jit(env.step)(env.reset(jax.random.key(0)), jax.numpy.zeros(8))  # such a model can be stepped
 
 
 def test_without_marked_goals_the_test_goal_is_the_longest_walk_away():

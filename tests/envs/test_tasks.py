@@ -67,6 +67,22 @@ def test_resets_use_the_goals_and_starts_of_the_options(name):
         assert len(np.unique(points, axis=0)) > min(len(arena.centres("0rg")), 100) / 2
 
 
+@pytest.mark.parametrize("name", ["point_maze", "point_2rooms", "point_maze_sparse"])
+def test_a_point_that_starts_anywhere_starts_clear_of_the_walls(name):
+    env = envs.make(name, start="free", **({"cell": 1.5} if name == "point_2rooms" else {}))
+    x, y = np.asarray(jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 4000)).obs[:, :2]).T
+    for x_lo, y_lo, x_hi, y_hi in env.arena.walls():
+        assert not ((x > x_lo - 0.499) & (x < x_hi + 0.499) & (y > y_lo - 0.499) & (y < y_hi + 0.499)).any()
+
+
+def test_nobody_in_the_gap_is_near_a_goal():
+    for options in ({"goals": "free"}, {"goals": "test"}):
+        env = envs.make("ant_fall", engine="native", **options)
+        goals = np.asarray(jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 500)).obs[:, -3:])
+        below = np.stack([goals[:, 0], np.clip(goals[:, 1], 12.3, 19.7), np.full(500, 0.8)], axis=1)
+        assert (np.linalg.norm(goals - below, axis=1) > env.success_radius).all()
+
+
 def test_published_maps_goals_and_radii():
     rows = {name: TASKS[name] for name in ("ant_maze", "ant_maze_cam", "ant_fall", "ant_push", "ant_maze_sparse")}
     assert rows["ant_fall"].goals["test"].lower == ((0.0, 27.0, 4.5),)
@@ -94,7 +110,8 @@ def test_cells_of_another_size_scale_x_and_y_and_leave_heights():
     assert [corner.tolist() for corner in env.space] == [[-2.0, -2.0, 0.0], [6.0, 14.0, 8.0]]
     assert env.region_cuts == ((2.0,), (6.0,), ()) and env.subgoal_scale == (5.0, 5.0, 0.5)
     assert env.reset(jax.random.key(0)).obs[-3:].tolist() == [0.0, 13.5, 4.5]
-    assert env.arena.floor_height == 4.0
+    assert (env.arena.floor_height, env.success_radius) == (4.0, 2.5)
+    assert TASKS["ant_maze_stochastic"].resized(2.0).block_noise == 0.25
 
 
 def test_sparse_reward_pays_success_and_only_that():
