@@ -125,6 +125,14 @@ def centre(abstraction: Abstraction) -> Float[Array, "R d"]:
     return (abstraction.lower + abstraction.upper) / 2
 
 
+def adjacent(abstraction: Abstraction) -> Bool[Array, "R R"]:
+    """Which active regions share a face; none is its own neighbour."""
+    lower = jnp.maximum(abstraction.lower[:, None], abstraction.lower[None])
+    upper = jnp.minimum(abstraction.upper[:, None], abstraction.upper[None])
+    faces = jnp.all(lower <= upper, axis=-1) & (jnp.sum(lower < upper, axis=-1) == lower.shape[-1] - 1)
+    return faces & abstraction.active[:, None] & abstraction.active[None]
+
+
 def inherit(table: Array, *, parent: Array, child: Array, axes: Sequence[int]) -> Array:
     """Copy what `table` holds for region `parent` to region `child` along each of `axes` in turn."""
     for axis in axes:

@@ -1,14 +1,24 @@
-"""The Commander: chooses the target region, every k env steps, by tabular Q-learning over regions.
+"""The Commander: chooses the target region, every k env steps, from a table of values over regions.
 
     target  <- epsilon-greedy in Q[region, goal region, .] over the successors that reachability allows
-    after k steps, with r = max (`max`, published) or mean (`mean`) over them of -||g* - s||:
+
+After k steps it learns in one of two ways. Q-learning (`q`, published), with r = max over them of -||g* - s||:
+
     Q[i, g, j] <- Q + alpha_n (r + gamma max_j' Q[i', g, j'] - Q)
 
 The B environments are B streams of one table: the errors of a cell are averaged over the n decisions of a batch that
-visited it, and alpha_n = 1 - (1 - alpha)^n is the step that n updates in a row towards that average would make. A batch
-is what all streams decided at one instant (`sweeps` 0, published), or in a whole epoch, swept `sweeps` times.
+visited it, and alpha_n = 1 - (1 - alpha)^n is the step that n updates in a row towards that average would make.
 
-Source: STAR (ICLR 2024), section 4.1.
+Planning (`model`): where a command leads does not depend on the goal, so every decision teaches about all goals.
+Counts of (i, j) -> i' and mean rewards make a model of the regions, on which value iteration runs at every instant:
+
+    Q[i, g, j] <- r[i, g, j] + gamma sum_i' P(i' | i, j) max_j' Q[i', g, j']
+
+The probabilities of i' sum to less than 1 where episodes were lost (terminated). What was not tried is believed to
+succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
+region gets there. `prior` decisions weigh as much as this belief.
+
+Source: STAR (ICLR 2024), section 4.1; optimistic model: R-max (Brafman and Tennenholtz 2002).
 """
 
 from __future__ import annotations
@@ -26,15 +36,33 @@ from star.config import CommanderConfig
 Metrics = dict[str, Array]
 
 
+class Model(struct.PyTreeNode):
+    """Fading counts of where commands led, and of the rewards on the way."""
+
+    led: Float[Array, "R R R"]
+    """Decisions by region, target and next region."""
+    rewards: Float[Array, "R R R"]
+    """Sums of rewards by region, goal region and target."""
+    visits: Float[Array, "R R R"]
+    """Decisions by region, goal region and target."""
+    lost: Float[Array, "R R"]
+    """Decisions by region and target during which the episode was terminated."""
+
+
 class CommanderState(struct.PyTreeNode):
-    """Q over (region, goal region, target region), and how often each target was chosen of late."""
+    """Q over (region, goal region, target region), how often each target was chosen of late, and the `model`, if any."""
 
     q: Float[Array, "R R R"]
     chosen: Float[Array, "R"]
+    model: Model | None = None
 
 
 class Decision(struct.PyTreeNode):
-    """Finished periods of N streams; `weight` is 1 where the period really lasted k env steps, else 0."""
+    """Finished periods of N streams.
+
+    `weight` is 1 where the period really lasted k env steps, `lost` is 1 where the task was terminated in it, and
+    `task` is 1 where the goal was that of the task, on which the reward depends, and not a region to practise.
+    """
 
     region: Int[Array, "N"]
     goal_region: Int[Array, "N"]
@@ -42,6 +70,8 @@ class Decision(struct.PyTreeNode):
     reward: Float[Array, "N"]
     next_region: Int[Array, "N"]
     weight: Float[Array, "N"]
+    lost: Float[Array, "N"]
+    task: Float[Array, "N"]
 
 
 class Successors(struct.PyTreeNode):
@@ -51,9 +81,11 @@ class Successors(struct.PyTreeNode):
     explore: Bool[Array, "R R"]
 
 
-def init(*, regions: int) -> CommanderState:
-    """Q = 0 everywhere: optimistic, since rewards are negative."""
-    return CommanderState(q=jnp.zeros((regions, regions, regions)), chosen=jnp.zeros(regions))
+def init(config: CommanderConfig, *, regions: int) -> CommanderState:
+    """Q = 0 everywhere, optimistic for rewards that are negative, and an empty model."""
+    cube = jnp.zeros((regions, regions, regions))
+    model = Model(led=cube, rewards=cube, visits=cube, lost=cube[0]) if config.learner == "model" else None
+    return CommanderState(q=cube, chosen=jnp.zeros(regions), model=model)
 
 
 def successors(
@@ -96,7 +128,7 @@ def act(
 ) -> Int[Array, "B"]:
     """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random."""
     explore_key, random_key, tie_key = jax.random.split(key, 3)
-    best = _values(state.q, allowed.greedy, region, goal_region)
+    best = jnp.where(allowed.greedy[region], state.q[region, goal_region], -jnp.inf)
     ties = best >= best.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best.shape), -1.0), axis=-1)
     anything = jnp.where(allowed.explore[region], jax.random.uniform(random_key, best.shape), -1.0)
@@ -104,23 +136,95 @@ def act(
     return jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
 
 
-def update(
-    config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision
-) -> tuple[CommanderState, Metrics]:
-    """One step of Q-learning on a batch; time limits are not seen here, so every period bootstraps."""
-    future = _values(state.q, allowed.greedy, batch.next_region, batch.goal_region).max(axis=-1)
+def observe(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> CommanderState:
+    """Take in what the streams decided at one instant: a step of Q-learning, or counts for the model."""
+    state = state.replace(chosen=state.chosen.at[batch.target].add(batch.weight))
+    if state.model is None:
+        return _q_learning(config, state, allowed, batch)
     cell = (batch.region, batch.goal_region, batch.target)
-    error = batch.reward + config.discount * future - state.q[cell]
-    visits = jnp.zeros_like(state.q).at[cell].add(batch.weight)
-    total = jnp.zeros_like(state.q).at[cell].add(batch.weight * error)
+    model = Model(
+        led=state.model.led.at[batch.region, batch.target, batch.next_region].add(batch.weight),
+        rewards=state.model.rewards.at[cell].add(batch.weight * batch.task * batch.reward),
+        visits=state.model.visits.at[cell].add(batch.weight * batch.task),
+        lost=state.model.lost.at[batch.region, batch.target].add(batch.lost),
+    )
+    return state.replace(model=model)
+
+
+def plan(
+    config: CommanderConfig,
+    state: CommanderState,
+    allowed: Successors,
+    *,
+    believed: Bool[Array, "R R"],
+    hoped: Float[Array, "R R"],
+) -> CommanderState:
+    """`config.sweeps` sweeps of value iteration on the model, from the values of last time.
+
+    As long as nothing is known, region j is held reachable from i where `believed` [i, j], and the reward in region i
+    for goals in region g is taken to be `hoped` [i, g], and a success where i aims at itself.
+    """
+    model, size = state.model, state.chosen.shape[0]
+    assert model is not None
+    identity = jnp.eye(size)
+    expected = jnp.where(believed[..., None], identity[None], identity[:, None])
+    led = model.led + config.prior * expected
+    chances = led / (led.sum(axis=-1) + model.lost)[..., None]
+    arrived = (config.reward == "success") * identity[:, :, None] * identity[:, None]
+    reward = (model.rewards + config.prior * (hoped[..., None] + arrived)) / (model.visits + config.prior)
+
+    def sweep(q: Array, _: None) -> tuple[Array, None]:
+        future = _best(q, allowed.greedy)
+        return reward + config.discount * jnp.einsum(
+            "ijn,ng->igj", chances, future, precision=jax.lax.Precision.HIGHEST
+        ), None
+
+    q, _ = jax.lax.scan(sweep, state.q, None, length=config.sweeps)
+    return state.replace(q=q)
+
+
+def fade(config: CommanderConfig, state: CommanderState) -> CommanderState:
+    """Let one epoch pass: the lower levels have learnt, so old decisions count less."""
+    model = state.model and jax.tree.map(lambda x: config.memory * x, state.model)
+    return state.replace(chosen=0.9 * state.chosen, model=model)
+
+
+def measure(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> Metrics:
+    """Mean reward of the decisions in `batch` and their mean absolute error of temporal difference."""
+    weight = batch.weight * batch.task
+    n = jnp.maximum(weight.sum(), 1.0)
+    error = _td_error(config, state, allowed, batch)
+    return {"reward": jnp.sum(batch.reward * weight) / n, "td_error": jnp.sum(jnp.abs(error) * weight) / n}
+
+
+def _q_learning(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> CommanderState:
+    cell = (batch.region, batch.goal_region, batch.target)
+    error = _td_error(config, state, allowed, batch)
+    weight = batch.weight * batch.task
+    visits = jnp.zeros_like(state.q).at[cell].add(weight)
+    total = jnp.zeros_like(state.q).at[cell].add(weight * error)
     alpha = 1 - (1 - config.learning_rate) ** visits
-    q = state.q + alpha * total / jnp.maximum(visits, 1.0)
-    n = jnp.maximum(batch.weight.sum(), 1.0)
-    metrics = {
-        "reward": jnp.sum(batch.reward * batch.weight) / n,
-        "td_error": jnp.sum(jnp.abs(error) * batch.weight) / n,
-    }
-    return state.replace(q=q), metrics
+    return state.replace(q=state.q + alpha * total / jnp.maximum(visits, 1.0))
+
+
+def _td_error(
+    config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision
+) -> Float[Array, "N"]:
+    """r + gamma max Q' - Q; time limits are not seen here, so every period bootstraps."""
+    future = _best(state.q, allowed.greedy)[batch.next_region, batch.goal_region]
+    return batch.reward + config.discount * future - state.q[batch.region, batch.goal_region, batch.target]
+
+
+def worth(
+    config: CommanderConfig, distance: Float[Array, "*n"], success: Float[Array, "*n"] | float, diameter: float | Array
+) -> Float[Array, "*n"]:
+    """The Commander's reward of one env step at a distance from g* in a space of that diameter.
+
+    Distances alone can deceive in a maze: where `success` counts too, it is what finally matters, and never negative.
+    """
+    if config.reward == "success":
+        return success + config.nearness * jnp.maximum(1 - distance / diameter, 0.0)
+    return -distance
 
 
 def start_reward(config: CommanderConfig) -> float:
@@ -134,7 +238,7 @@ def accumulate(
     external: Float[Array, "l B"],
     alive: Float[Array, "l B"],
 ) -> Float[Array, "B"]:
-    """The reward of periods so far, after l more env steps with external rewards r_ext; `alive` masks ended ones.
+    """The reward of periods so far, after l more env steps with rewards `external`; `alive` masks ended ones.
 
     The maximum is the same whether the agent stays at the goal or leaves it again; the mean tells them apart.
     """
@@ -143,28 +247,22 @@ def accumulate(
     return reward + jnp.sum(external * alive, axis=0) / config.period
 
 
-def sweep(
-    config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision
-) -> tuple[CommanderState, Metrics]:
-    """`config.sweeps` updates on the decisions of a whole epoch: fitted Q iteration.
-
-    All environments live through the phases of an episode together, so the visitors of a cell at one instant are not
-    representative (late in an episode, they are those that are stuck there); those of an epoch are.
-    """
-    state, metrics = jax.lax.scan(
-        lambda state, _: update(config, state, allowed, batch), state, None, length=config.sweeps
-    )
-    return state, jax.tree.map(lambda x: x[-1], metrics)
-
-
 def on_split(state: CommanderState, *, parent: Int[Array, ""], child: Int[Array, ""]) -> CommanderState:
-    """The new region inherits rows and columns of the one it was cut from; they share its visits."""
-    shared = state.chosen.at[parent].multiply(0.5)
+    """The new region inherits rows and columns of the one it was cut from; they share what arrived there."""
+    cells = lambda table, axes: inherit(table, parent=parent, child=child, axes=axes)  # noqa: E731
+    model = state.model
+    if model is not None:
+        model = Model(
+            led=cells(model.led.at[:, :, parent].multiply(0.5), (0, 1, 2)),
+            rewards=cells(model.rewards, (0, 1, 2)),
+            visits=cells(model.visits, (0, 1, 2)),
+            lost=cells(model.lost, (0, 1)),
+        )
     return CommanderState(
-        q=inherit(state.q, parent=parent, child=child, axes=(0, 1, 2)),
-        chosen=inherit(shared, parent=parent, child=child, axes=(0,)),
+        q=cells(state.q, (0, 1, 2)), chosen=cells(state.chosen.at[parent].multiply(0.5), (0,)), model=model
     )
 
 
-def _values(q: Array, allowed: Bool[Array, "R R"], region: Array, goal_region: Array) -> Float[Array, "N R"]:
-    return jnp.where(allowed[region], q[region, goal_region], -jnp.inf)
+def _best(q: Float[Array, "R R R"], allowed: Bool[Array, "R R"]) -> Float[Array, "R R"]:
+    """Value of every region and goal region; 0 for regions that are not in use."""
+    return jnp.where(allowed.any(axis=1)[:, None], jnp.where(allowed[:, None], q, -jnp.inf).max(axis=-1), 0.0)

@@ -68,6 +68,7 @@ class EnvConfig(Section):
     name: str = Field("point_maze", description="task, one of `star envs`")
     engine: Literal["auto", "warp", "jax", "native"] = Field("auto", description="physics engine")
     options: dict[str, Any] = Field({}, description="options of the task, passed to envs.make")
+    training: dict[str, Any] = Field({}, description="options that differ in training from those above")
 
 
 class PPOConfig(Section):
@@ -118,23 +119,31 @@ class TD3Config(BufferedConfig):
 
 
 class CommanderConfig(Section):
-    """The Commander: tabular Q-learning over regions."""
+    """The Commander: a table of values over regions."""
 
+    enabled: bool = Field(True, description="false commands the goal itself all the time, as in HIRO")
+    learner: Literal["model", "q"] = Field("model", description="planning on a learnt model of regions, or Q-learning")
     period: Positive = Field(30, description="k: env steps between the Commander's decisions")
-    learning_rate: float = Field(0.01, gt=0, le=1, description="alpha, applied once per stream and visited cell")
+    learning_rate: float = Field(
+        0.01, gt=0, le=1, description="alpha of learner q, applied once per stream and visited cell"
+    )
     discount: float = Field(0.95, ge=0, lt=1, description="gamma per decision")
     epsilon_start: float = Field(0.5, ge=0, le=1, description="share of random targets at the start")
     epsilon_end: float = Field(0.1, ge=0, le=1, description="share of random targets after epsilon_steps")
     epsilon_steps: float = Field(1e6, gt=0, description="env steps over which epsilon falls linearly")
+    practice: float = Field(
+        0.25, ge=0, le=1, description="share of environments that practise reaching random regions, one after another"
+    )
     successors: Literal["any", "possible", "known"] = Field(
         "any", description="greedy choice among all targets, those not shown unreachable, or the known-reachable ones"
     )
-    reward: Literal["mean", "max"] = Field(
-        "mean", description="mean of r_ext over the k env steps of a decision, or its maximum"
+    reward: Literal["success", "mean", "max"] = Field(
+        "success", description="of a decision: mean success and nearness of its k env steps, or mean or maximum of r_ext"
     )
-    sweeps: Count = Field(
-        20, description="sweeps over all decisions of an epoch between episodes; 0 learns at every instant instead"
-    )
+    nearness: float = Field(0.2, ge=0, description="weight in reward success of 1 - distance / diameter of the space")
+    sweeps: Positive = Field(10, description="sweeps of value iteration of learner model after every k env steps")
+    prior: float = Field(5.0, gt=0, description="decisions that weigh as much as the belief in what was not tried")
+    memory: float = Field(0.5, ge=0, le=1, description="share of a decision's weight in the model left an epoch later")
     goal_margin: float = Field(
         1.0, gt=0, description="half-width of the box around g* given to the Tutor in its region"
     )
@@ -153,6 +162,7 @@ class LevelConfig(Section):
 class TutorConfig(LevelConfig):
     """The Tutor: chooses the subgoal on the way to the target region."""
 
+    enabled: bool = Field(True, description="false gives the target box to the Controller itself, as in GARA")
     period: Positive = Field(10, description="l: env steps between the Tutor's decisions")
     unroll: Positive = Field(5, description="decisions of each environment per update")
     relative_bounds: bool = Field(True, description="observe the region's bounds relative to the agent")
@@ -195,6 +205,7 @@ class RefinementConfig(Section):
     """When and where a region is split."""
 
     enabled: bool = Field(True, description="false keeps the initial regions")
+    within: bool = Field(True, description="examine too whether a region reaches the goals inside it")
     min_transitions: Positive = Field(5000, description="commanded transitions before a pair is examined")
     error_tolerance: float = Field(
         0.1, ge=0, description="the model's error on a pair is stable once it falls by less than this share an epoch"
@@ -203,7 +214,7 @@ class RefinementConfig(Section):
     miss_share: float = Field(0.1, ge=0, lt=1, description="tau2: share of the target covered below which a box misses")
     depth: Annotated[int, Field(ge=1, le=8)] = Field(5, description="boxes are halved this often: 5 is 1/32")
     min_visits: Positive = Field(100, description="visited start states a reaching box needs")
-    pairs_per_epoch: Positive = Field(4, description="pairs examined after each epoch")
+    pairs_per_epoch: Positive = Field(16, description="pairs examined after each epoch")
     cuts_per_pair: Positive = Field(1, description="cuts one examined pair may make")
     miss_lifetime: Positive = Field(10, description="epochs after which a MISSES verdict is forgotten")
 

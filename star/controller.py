@@ -4,6 +4,9 @@
     g_{t+1} = s_t + g_t - s_{t+1}                           the subgoal stays where it is while the agent moves
     reward  = -||s_t + g_t - s_{t+1}||  (`distance`, published)   or   ||g_t|| - ||g_{t+1}||  (`progress`)
 
+Without a Tutor the subgoal is the target box itself, its lower and upper corner relative to s, [2d] numbers, and
+||.|| is the distance to the box, as in GARA (Zadem, Mover and Nguyen 2023).
+
 Source: STAR (ICLR 2024), section 4.1, after HIRO (Nachum et al. 2018), section 3.2.
 """
 
@@ -19,23 +22,32 @@ from star.config import ControllerConfig
 
 
 def observe(
-    state: Float[Array, "*batch state"], subgoal: Float[Array, "*batch d"], *, position: Sequence[int]
-) -> Float[Array, "*batch state-p+d"]:
+    state: Float[Array, "*batch state"], subgoal: Float[Array, "*batch m"], *, position: Sequence[int]
+) -> Float[Array, "*batch state-p+m"]:
     """The state without its coordinates `position`, followed by the relative subgoal."""
     kept = np.setdiff1d(np.arange(state.shape[-1]), np.asarray(position, int))
     return jnp.concatenate([state[..., kept], subgoal], axis=-1)
 
 
 def next_subgoal(
-    subgoal: Float[Array, "*batch d"], achieved: Float[Array, "*batch d"], next_achieved: Float[Array, "*batch d"]
-) -> Float[Array, "*batch d"]:
+    subgoal: Float[Array, "*batch m"], achieved: Float[Array, "*batch d"], next_achieved: Float[Array, "*batch d"]
+) -> Float[Array, "*batch m"]:
     """The same subgoal seen from where the agent is now: h(s, g, s') = s + g - s'."""
-    return achieved + subgoal - next_achieved
+    moved = jnp.tile(next_achieved - achieved, subgoal.shape[-1] // achieved.shape[-1])
+    return subgoal - moved
+
+
+def distance(subgoal: Float[Array, "*batch m"], *, size: int) -> Float[Array, "*batch"]:
+    """Distance to a subgoal of `size` = d coordinates, or to a box given by two corners."""
+    if subgoal.shape[-1] == size:
+        return jnp.linalg.norm(subgoal, axis=-1)
+    lower, upper = jnp.split(subgoal, 2, axis=-1)
+    return jnp.linalg.norm(jnp.maximum(lower, 0.0) - jnp.minimum(upper, 0.0), axis=-1)
 
 
 def reward(
-    config: ControllerConfig, subgoal: Float[Array, "*batch d"], next_subgoal: Float[Array, "*batch d"]
+    config: ControllerConfig, subgoal: Float[Array, "*batch m"], next_subgoal: Float[Array, "*batch m"], *, size: int
 ) -> Float[Array, "*batch"]:
-    """Reward of one env step from the relative subgoals before and after it."""
-    before, after = jnp.linalg.norm(subgoal, axis=-1), jnp.linalg.norm(next_subgoal, axis=-1)
+    """Reward of one env step from the relative subgoals before and after it, of `size` = d coordinates or boxes."""
+    before, after = distance(subgoal, size=size), distance(next_subgoal, size=size)
     return config.reward_scale * (-after if config.reward == "distance" else before - after)

@@ -29,11 +29,16 @@ from star.state import Spec, TrainState
 from star.tutor import Box
 
 
+_ANY = 1_000_000  # a region to practise that is still to be drawn; larger than any index
+
+
 class Streams(struct.PyTreeNode):
     """The B environments and where each stands in its Commander period."""
 
     env: EnvState
     clock: Int[Array, "B"]
+    practice: Int[Array, "B"]
+    """The region that an environment practises to reach; -1 where it pursues the goal of the task."""
     region: Int[Array, "B"]
     goal_region: Int[Array, "B"]
     target: Int[Array, "B"]
@@ -71,12 +76,14 @@ class Steps(struct.PyTreeNode):
 
     obs: Float[Array, "l B obs"]
     next_obs: Float[Array, "l B obs"]
-    subgoal: Float[Array, "l B d"]
-    next_subgoal: Float[Array, "l B d"]
+    subgoal: Float[Array, "l B m"]
+    next_subgoal: Float[Array, "l B m"]
     action: Float[Array, "l B act"]
     reward: Float[Array, "l B"]
     terminated: Float[Array, "l B"]
     ended: Float[Array, "l B"]
+    success: Float[Array, "l B"]
+    distance: Float[Array, "l B"]
     alive: Float[Array, "l B"]
     non_finite: Float[Array, "l B"]
     overflow: Float[Array, "l B"]
@@ -96,7 +103,7 @@ def play(
     The latter has the leading axis [T] of all env steps of the episode; it is None without `record`.
     """
     reset_key, scan_key = jax.random.split(key)
-    streams = start(spec, env, state.abstraction, key=reset_key)
+    streams = start(spec, env, key=reset_key)
     allowed = successors(config, state)
 
     def segment(streams: Streams, key: Array) -> tuple[Streams, Any]:
@@ -113,15 +120,17 @@ def play(
     return streams, jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), recorded)
 
 
-def start(spec: Spec, env: VectorEnv, abstraction: Abstraction, *, key: Array) -> Streams:
-    """Fresh environments with their clocks at 0."""
-    env_state = env.reset(key)
+def start(spec: Spec, env: VectorEnv, *, practice: Float[Array, ""] | float = 0.0, key: Array) -> Streams:
+    """Fresh environments with their clocks at 0. A share `practice` of them is to practise."""
+    reset_key, practice_key = jax.random.split(key)
+    env_state = env.reset(reset_key)
     n = env.num_envs
     nothing = jnp.zeros(n, jnp.int32)
     abstract = spec.abstract(env_state.obs)
     return Streams(
         env=env_state,
         clock=nothing,
+        practice=jnp.where(jax.random.uniform(practice_key, (n,)) < practice, _ANY, -1),
         region=nothing,
         goal_region=nothing,
         target=nothing,
@@ -156,14 +165,22 @@ def command(
     obs = streams.env.obs
     locate = jax.vmap(partial(regions.locate, state.abstraction))
     region, goal_region = locate(spec.abstract(obs)), locate(spec.goal_point(obs))
-    target = commander.act(state.commander, allowed, region, goal_region, epsilon=epsilon, key=key)
+    target, practice = goal_region, streams.practice
+    if config.commander.enabled:
+        act_key, practice_key = jax.random.split(key)
+        another = jax.random.randint(practice_key, practice.shape, 0, state.abstraction.count)
+        practice = jnp.where((practice == region) | (practice == _ANY), another, practice)
+        goal_region = jnp.where(practice >= 0, practice, goal_region)
+        target = commander.act(state.commander, allowed, region, goal_region, epsilon=epsilon, key=act_key)
+    holds_goal = (target == goal_region) & (practice < 0)
     fresh = Streams(
         env=streams.env,
         clock=streams.clock,
+        practice=practice,
         region=region,
         goal_region=goal_region,
         target=target,
-        box=target_box(config, spec, state.abstraction, target, goal_region, spec.goal_point(obs)),
+        box=target_box(config, spec, state.abstraction, target, holds_goal, spec.goal_point(obs)),
         start=spec.abstract(obs),
         reward=jnp.full_like(streams.reward, commander.start_reward(config.commander)),
         episode=streams.episode,
@@ -176,22 +193,25 @@ def target_box(
     spec: Spec,
     abstraction: Abstraction,
     target: Int[Array, "B"],
-    goal_region: Int[Array, "B"],
+    holds_goal: Bool[Array, "B"],
     goal_point: Float[Array, "B d"],
 ) -> Box:
-    """Bounds that the Tutor is given: those of the target region, or g* +- margin if g* lies in that region."""
+    """Bounds that the Tutor is given: those of the target region, or g* +- margin where it `holds_goal`."""
     margin = config.commander.goal_margin
-    around = (target == goal_region)[:, None] & spec.in_goal()
+    around = holds_goal[:, None] & spec.in_goal()
     lower, upper = abstraction.lower[target], abstraction.upper[target]
     return Box(lower=jnp.where(around, goal_point - margin, lower), upper=jnp.where(around, goal_point + margin, upper))
 
 
 def choose_subgoal(
     config: AgentConfig, spec: Spec, state: TrainState, streams: Streams, *, deterministic: bool, key: Array
-) -> tuple[Float[Array, "B d"], Float[Array, "B d"]]:
-    """(subgoal, action) of the Tutor in every environment."""
+) -> tuple[Float[Array, "B m"], Float[Array, "B d"] | None]:
+    """(subgoal, action) of the Tutor in every environment; without a Tutor the target box and None."""
     obs = streams.env.obs
-    seen = tutor.observe(config.tutor, spec.state(obs), spec.abstract(obs), streams.box)
+    position = spec.abstract(obs)
+    if state.tutor is None:
+        return jnp.concatenate([streams.box.lower - position, streams.box.upper - position], axis=-1), None
+    seen = tutor.observe(config.tutor, spec.state(obs), position, streams.box)
     action = learner.act(config.tutor, state.tutor, seen, deterministic=deterministic, key=key)
     return tutor.subgoal(action, spec.scale), action
 
@@ -202,7 +222,7 @@ def rollout(
     env: VectorEnv,
     state: TrainState,
     streams: Streams,
-    subgoal: Float[Array, "B d"],
+    subgoal: Float[Array, "B m"],
     *,
     deterministic: bool,
     record: Record | None = None,
@@ -225,6 +245,8 @@ def rollout(
             next_subgoal=after,
             action=action,
             reward=env_state.reward,
+            success=env_state.metrics["success"],
+            distance=env_state.metrics["distance"],
             terminated=env_state.done * (1 - env_state.info["truncation"]),
             ended=env_state.done * (env_state.info["steps"] < spec.episode_length),
             alive=alive,
@@ -236,7 +258,8 @@ def rollout(
 
     carry = (streams.env, subgoal, 1 - streams.env.done, streams.episode)
     (env_state, _, _, episode), steps = jax.lax.scan(step, carry, jax.random.split(key, config.tutor.period))
-    reward = commander.accumulate(config.commander, streams.reward, steps.reward, steps.alive)
+    worth = commander.worth(config.commander, steps.distance, steps.success, spec.diameter)
+    reward = commander.accumulate(config.commander, streams.reward, worth, steps.alive)
     return streams.replace(env=env_state, episode=episode, reward=reward), steps
 
 

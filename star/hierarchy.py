@@ -8,6 +8,8 @@
             every `unroll` segments: Tutor learns
         forward model learns from the epoch's periods; refinement
 
+Each level but the Controller can be left out (`enabled`): no Commander is HIRO, no Tutor is GARA, neither is flat.
+
 A period cut short by the end of an episode teaches neither the Commander nor the forward model, because it did not
 last k steps.
 """
@@ -24,7 +26,7 @@ from jaxtyping import Array, Float
 from envs.vector import VectorEnv
 from star import abstraction as regions
 from star import commander, controller, episode, forward_model, learner, refinement, tutor
-from star.commander import CommanderState, Decision
+from star.commander import CommanderState, Decision, Successors
 from star.config import AgentConfig
 from star.episode import Episode, Steps, Streams
 from star.forward_model import Outcome
@@ -38,39 +40,47 @@ Metrics = dict[str, Array]
 def epoch(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState) -> tuple[TrainState, Metrics]:
     """One episode of all environments, its updates, one refinement."""
     key, reset_key, scan_key, end_key = jax.random.split(state.key, 4)
-    streams = episode.start(spec, env, state.abstraction, key=reset_key)
-    blocks = spec.episode_length // (config.tutor.period * config.tutor.unroll)
+    streams = episode.start(spec, env, practice=config.commander.practice, key=reset_key)
+    segments = spec.episode_length // config.tutor.period
+    blocks = (segments // config.tutor.unroll, config.tutor.unroll)
     (state, streams), (outcomes, metrics, counts) = jax.lax.scan(
-        partial(_block, config, spec, env), (state.replace(key=key), streams), jax.random.split(scan_key, blocks)
+        partial(_block, config, spec, env),
+        (state.replace(key=key), streams),
+        (jax.random.split(scan_key, blocks[0]), jnp.arange(segments).reshape(blocks)),
     )
     metrics = jax.tree.map(jnp.mean, metrics) | jax.tree.map(jnp.sum, counts)
-    metrics |= _episode_metrics("train", streams.episode)
+    metrics |= _episode_metrics("train", streams.episode, streams.practice < 0)
     outcomes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), outcomes)
-    state, more = _learn_between_episodes(config, spec, state, outcomes, env.num_envs, key=end_key)
-    metrics |= more | {"commander/epsilon": commander.epsilon(config.commander, _env_steps(spec, env, state))}
+    if config.commander.enabled:
+        epsilon = commander.epsilon(config.commander, _env_steps(spec, env, state))
+        state, more = _learn_between_episodes(config, spec, state, outcomes, env.num_envs, key=end_key)
+        metrics |= more | {"commander/epsilon": epsilon}
     return state.replace(epoch=state.epoch + 1), metrics
 
 
 def _block(
-    config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], key: Array
+    config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], inputs: tuple[Array, Array]
 ) -> tuple[tuple[TrainState, Streams], tuple[Any, Metrics, Metrics]]:
-    """`tutor.unroll` segments, then one update of the Tutor."""
-    scan_key, update_key, relabel_key = jax.random.split(key, 3)
+    """`tutor.unroll` segments, whose numbers are given, then one update of the Tutor."""
+    scan_key, update_key = jax.random.split(inputs[0])
     carry, (decisions, outcomes, metrics, counts) = jax.lax.scan(
-        partial(_segment, config, spec, env), carry, jax.random.split(scan_key, config.tutor.unroll)
+        partial(_segment, config, spec, env), carry, (jax.random.split(scan_key, config.tutor.unroll), inputs[1])
     )
     state, streams = carry
-    relabel = _relabel(config, spec, state) if config.tutor.off_policy_correction else None
-    tutor_state, tutor_metrics = learner.update(config.tutor, state.tutor, decisions, relabel=relabel, key=update_key)
-    metrics = jax.tree.map(jnp.mean, metrics) | _prefix("tutor", tutor_metrics)
-    return (state.replace(tutor=tutor_state), streams), (outcomes, metrics, counts)
+    metrics = jax.tree.map(jnp.mean, metrics)
+    if config.tutor.enabled:
+        relabel = _relabel(config, spec, state) if config.tutor.off_policy_correction else None
+        learnt, more = learner.update(config.tutor, state.tutor, decisions, relabel=relabel, key=update_key)
+        state, metrics = state.replace(tutor=learnt), metrics | _prefix("tutor", more)
+    return (state, streams), (outcomes, metrics, counts)
 
 
 def _segment(
-    config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], key: Array
-) -> tuple[tuple[TrainState, Streams], tuple[Transition, Any, Metrics, Metrics]]:
+    config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], inputs: tuple[Array, Array]
+) -> tuple[tuple[TrainState, Streams], tuple[Transition | None, Any, Metrics, Metrics]]:
     """One decision of the Tutor: command, act, roll out, let Controller and Commander learn."""
     state, streams = carry
+    key, number = inputs
     command_key, tutor_key, rollout_key, update_key, reset_key = jax.random.split(key, 5)
     allowed = episode.successors(config, state)
     share = commander.epsilon(config.commander, _env_steps(spec, env, state))
@@ -84,18 +94,17 @@ def _segment(
     controller_state, controller_metrics = learner.update(
         config.controller, state.controller, experience, key=update_key
     )
-    streams = episode.advance(config, streams)
-    decision, outcome = _finished_period(config, spec, state, streams, steps)
-    commander_state = state.commander
-    if not config.commander.sweeps:
-        commander_state, _ = commander.update(config.commander, commander_state, allowed, decision)
-    transition = _tutor_transition(config, spec, streams, began, tutor_action, steps)
-    commander_state = commander_state.replace(chosen=commander_state.chosen.at[decision.target].add(decision.weight))
     metrics = _prefix(
         "controller", controller_metrics | {"reward": _weighted(experience.reward, experience.weight)}
-    ) | {
-        "tutor/reward": transition.reward.mean(),
-    }
+    )
+    streams = episode.advance(config, streams)
+    decision, outcome = _finished_period(config, spec, state, streams, steps)
+    if config.commander.enabled:
+        state = state.replace(commander=_command_better(config, spec, state, allowed, decision, number))
+    transition = None
+    if tutor_action is not None:
+        transition = _tutor_transition(config, spec, streams, began, tutor_action, steps)
+        metrics |= {"tutor/reward": transition.reward.mean()}
     counts = {
         f"env/{name}": (value * steps.alive).sum()
         for name, value in (
@@ -105,32 +114,48 @@ def _segment(
         )
     }
     streams = episode.restart_ended(env, streams, steps, key=reset_key)
-    state = state.replace(controller=controller_state, commander=commander_state)
-    return (state, streams), (transition, (decision, outcome), metrics, counts)
+    return (state.replace(controller=controller_state), streams), (transition, (decision, outcome), metrics, counts)
+
+
+def _command_better(
+    config: AgentConfig, spec: Spec, state: TrainState, allowed: Successors, decision: Decision, number: Array
+) -> CommanderState:
+    """The Commander after the decisions that ended with segment `number` of the episode."""
+    learnt = commander.observe(config.commander, state.commander, allowed, decision)
+    if learnt.model is None:
+        return learnt
+    believed = state.graph.reaches | (regions.adjacent(state.abstraction) & ~state.graph.misses)
+    centre = regions.centre(state.abstraction)
+    apart = jnp.linalg.norm(centre[:, None] - centre, axis=-1)
+    hoped = commander.worth(config.commander, apart, 0.0, spec.diameter)
+    period = config.commander.period // config.tutor.period
+    plan = partial(commander.plan, config.commander, allowed=allowed, believed=believed, hoped=hoped)
+    return jax.lax.cond(number % period == period - 1, plan, lambda same: same, learnt)
 
 
 def _learn_between_episodes(
     config: AgentConfig, spec: Spec, state: TrainState, finished: tuple[Decision, Outcome], num_envs: int, *, key: Array
 ) -> tuple[TrainState, Metrics]:
-    """Let Commander and forward model learn from the epoch's periods, then refine the abstraction."""
-    pick_key, train_key = jax.random.split(key)
-    learn = commander.sweep if config.commander.sweeps else commander.update
-    learnt, commander_metrics = learn(config.commander, state.commander, episode.successors(config, state), finished[0])
-    if config.commander.sweeps:
-        state = state.replace(commander=learnt)
+    """Let the forward model learn from the epoch's periods, then refine the abstraction."""
+    pick_key, train_key, refine_key = jax.random.split(key, 3)
+    commander_metrics = commander.measure(
+        config.commander, state.commander, episode.successors(config, state), finished[0]
+    )
     periods = num_envs * (spec.episode_length // config.commander.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
     error = forward_model.errors(config.forward_model, state.forward_model, outcome)
-    plain = outcome.weight * (decision.target != decision.goal_region)
+    at_goal = (decision.target == decision.goal_region) & (decision.task > 0)
+    counted = outcome.weight * (at_goal == (decision.region == decision.target))
     graph = refinement.observe(
-        config, state.graph, region=decision.region, target=decision.target, error=error, weight=plain
+        config, state.graph, region=decision.region, target=decision.target, error=error, weight=counted
     )
     model, model_metrics = forward_model.train(config.forward_model, state.forward_model, outcome, key=train_key)
     state = state.replace(forward_model=model, graph=graph)
     refine_metrics: Metrics = {}
     if config.refinement.enabled:
-        state, refine_metrics = refine(config, state)
-    state = state.replace(commander=state.commander.replace(chosen=0.9 * state.commander.chosen))
+        goals = refinement.Goals(lower=outcome.lower, upper=outcome.upper, weight=outcome.weight * at_goal)
+        state, refine_metrics = refine(config, spec, state, goals, key=refine_key)
+    state = state.replace(commander=commander.fade(config.commander, state.commander))
     metrics = (
         _prefix("commander", commander_metrics)
         | _prefix("forward_model", model_metrics | {"error": jnp.sqrt(_weighted(error, outcome.weight))})
@@ -140,9 +165,13 @@ def _learn_between_episodes(
     return state, metrics
 
 
-def refine(config: AgentConfig, state: TrainState) -> tuple[TrainState, Metrics]:
+def refine(
+    config: AgentConfig, spec: Spec, state: TrainState, goals: refinement.Goals, *, key: Array
+) -> tuple[TrainState, Metrics]:
     """Examine pairs, cut regions, and let the tables that regions index follow every cut."""
-    abstraction, graph, splits, metrics = refinement.refine(config, state.abstraction, state.graph, state.forward_model)
+    abstraction, graph, splits, metrics = refinement.refine(
+        config, state.abstraction, state.graph, state.forward_model, goals, radius=spec.success_radius, key=key
+    )
 
     def follow(commander_state: CommanderState, split: refinement.Split) -> tuple[CommanderState, None]:
         after = commander.on_split(commander_state, parent=split.parent, child=split.child)
@@ -158,7 +187,9 @@ def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transi
     return Transition(
         obs=observe(spec.state(steps.obs), steps.subgoal),
         action=steps.action,
-        reward=controller.reward(config.controller, steps.subgoal, steps.next_subgoal),
+        reward=controller.reward(
+            config.controller, steps.subgoal, steps.next_subgoal, size=len(spec.abstract_indices)
+        ),
         next_obs=observe(spec.state(steps.next_obs), steps.next_subgoal),
         terminated=steps.terminated,
         cut=jnp.maximum(last, steps.ended),
@@ -206,6 +237,8 @@ def _finished_period(
         reward=streams.reward,
         next_region=jax.vmap(partial(regions.locate, state.abstraction))(end),
         weight=weight,
+        lost=jnp.max(steps.terminated * steps.alive, axis=0),
+        task=(streams.practice < 0).astype(weight.dtype),
     )
     outcome = Outcome(start=streams.start, lower=streams.box.lower, upper=streams.box.upper, end=end, weight=weight)
     return decision, outcome
@@ -235,12 +268,12 @@ def _env_steps(spec: Spec, env: VectorEnv, state: TrainState) -> Float[Array, ""
     return state.epoch.astype(jnp.float32) * (spec.episode_length * env.num_envs)
 
 
-def _episode_metrics(name: str, episode: Episode) -> Metrics:
+def _episode_metrics(name: str, episode: Episode, weight: Array) -> Metrics:
     return {
-        f"{name}/success_any": episode.success_any.mean(),
-        f"{name}/success_final": episode.success_final.mean(),
-        f"{name}/distance": episode.distance.mean(),
-        f"{name}/return": episode.total.mean(),
+        f"{name}/success_any": _weighted(episode.success_any, weight),
+        f"{name}/success_final": _weighted(episode.success_final, weight),
+        f"{name}/distance": _weighted(episode.distance, weight),
+        f"{name}/return": _weighted(episode.total, weight),
     }
 
 

@@ -72,8 +72,10 @@ class Display:
     def update(self, env_steps: int, rows: Sequence[Mapping[str, Any]], *, left_s: float) -> None:
         """Show the rows of one epoch, one per seed."""
         speed = rows[0]["env_steps_per_s"]
+        status = f"{speed:,.0f} env steps/s"
         regions = mean(rows, "abstraction/regions")
-        status = f"{speed:,.0f} env steps/s  regions {regions:.0f}"
+        if regions is not None:
+            status += f"  regions {regions:.0f}"
         success = mean(rows, "eval/success_final")
         if success is not None:
             self._success = success

@@ -9,6 +9,10 @@
         none does:               MISSES, for `miss_lifetime` epochs, since the low levels are still learning
         some do:                 cut i along the axis that best parts the reaching from the missing leaves
 
+With `within`, pairs (i, i) are examined too: does a region reach the goals inside it? They count decisions of agents
+in i whose goal lies in i. A goal met of late is drawn, and the square inside its circle of success is the box to
+reach. Only cuts come of it, no verdicts, since the next goal may be another one.
+
 Source: STAR (ICLR 2024), section 4.3 and algorithm 2.
 """
 
@@ -49,6 +53,14 @@ class Graph(struct.PyTreeNode):
     def misses(self) -> Bool[Array, "R R"]:
         """Pairs shown unreachable, and not yet forgotten."""
         return self.verdict == MISSES
+
+
+class Goals(struct.PyTreeNode):
+    """Boxes around task goals that were commanded of late; `weight` masks."""
+
+    lower: Float[Array, "N d"]
+    upper: Float[Array, "N d"]
+    weight: Float[Array, "N"]
 
 
 def init(*, capacity: int) -> Graph:
@@ -97,8 +109,9 @@ def forget(config: AgentConfig, graph: Graph) -> Graph:
 
 def due(config: AgentConfig, graph: Graph, active: Bool[Array, "R"]) -> Bool[Array, "R R"]:
     """The pairs that pass the gate."""
-    off_diagonal = ~jnp.eye(active.shape[0], dtype=bool)
-    pairs = active[:, None] & active[None, :] & off_diagonal
+    pairs = active[:, None] & active[None, :]
+    if not config.refinement.within:
+        pairs &= ~jnp.eye(active.shape[0], dtype=bool)
     commanded = graph.transitions >= config.refinement.min_transitions
     return pairs & commanded & graph.stable & (graph.verdict == UNKNOWN)
 
@@ -150,34 +163,52 @@ class Split(struct.PyTreeNode):
 
 
 def refine(
-    config: AgentConfig, abstraction: Abstraction, graph: Graph, model: ForwardModelState
+    config: AgentConfig,
+    abstraction: Abstraction,
+    graph: Graph,
+    model: ForwardModelState,
+    goals: Goals,
+    *,
+    radius: float | Array,
+    key: Array,
 ) -> tuple[Abstraction, Graph, Split, Metrics]:
     """Examine the due pairs of one epoch, at most `pairs_per_epoch`, and cut where a verdict is mixed.
 
-    Returns the splits in the order made, stacked [pairs_per_epoch * cuts_per_pair], for tables indexed by region.
+    `radius` is that of success around goals. Returns the splits in the order made, stacked [pairs_per_epoch * cuts_per_pair], for tables indexed by region.
     """
     graph = forget(config, graph)
     starts, seen = forward_model.visited(model)
 
-    def one_pair(carry: tuple[Abstraction, Graph], _: None) -> tuple[tuple[Abstraction, Graph], tuple]:
+    def one_pair(carry: tuple[Abstraction, Graph], goal_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
         abstraction, graph = carry
         waiting = due(config, graph, abstraction.active)
         region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, graph.transitions, -1.0)), waiting.shape)
         found = waiting[region, target]
-        leaves = _examine(config, abstraction, model, region, target, starts, seen)
+        inside = region == target
+        goal, there = _draw_goal(abstraction, region, goals, key=goal_key)
+        judged = found & (~inside | there)
+        commanded = (
+            jnp.where(inside, goal[0], abstraction.lower[target]),
+            jnp.where(inside, goal[1], abstraction.upper[target]),
+        )
+        widened = jnp.maximum(radius / jnp.sqrt(starts.shape[1]) - (goal[1] - goal[0]) / 2, 0.0) * inside
+        wanted = (commanded[0] - widened, commanded[1] + widened)
+        leaves = _examine(config, abstraction, model, region, commanded, wanted, starts, seen)
         verdict = reachability.summary(leaves)
-        settled = found & (verdict != MIXED)
+        settled = judged & (verdict != MIXED) & ~inside
         graph = graph.replace(
             verdict=graph.verdict.at[region, target].set(jnp.where(settled, verdict, graph.verdict[region, target])),
             age=graph.age.at[region, target].set(jnp.where(found, 0, graph.age[region, target])),
-            transitions=graph.transitions.at[region, target].multiply(jnp.where(found, 0.0, 1.0)),
+            transitions=graph.transitions.at[region, target].multiply(
+                jnp.where(found, jnp.where(inside, 0.5, 0.0), 1.0)  # another goal may be drawn
+            ),
         )
-        mixed = found & (verdict == MIXED)
+        mixed = judged & (verdict == MIXED)
         abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed)
         return (abstraction, graph), (splits, found, mixed)
 
     (abstraction, graph), (splits, found, mixed) = jax.lax.scan(
-        one_pair, (abstraction, graph), None, length=config.refinement.pairs_per_epoch
+        one_pair, (abstraction, graph), jax.random.split(key, config.refinement.pairs_per_epoch)
     )
     splits = jax.tree.map(lambda x: x.reshape(-1), splits)
     metrics = {
@@ -192,20 +223,29 @@ def refine(
 
 
 def on_split(graph: Graph, split: Split) -> Graph:
-    """Parts of a region inherit what held for all of it as a start; as targets they are new, so nothing is known."""
-    inherit = partial(regions.inherit, parent=split.parent, child=split.child, axes=(0,))
-    old = graph
-    graph = jax.tree.map(inherit, graph)
+    """Parts of a region inherit what held for all of it; as targets they are new, so their verdicts are unknown.
+
+    All pairs with one of the parts must be commanded anew before they are examined.
+    """
+    inherit = partial(regions.inherit, parent=split.parent, child=split.child, axes=(0, 1))
     changed = jnp.zeros(graph.verdict.shape[0], bool).at[jnp.array([split.parent, split.child])].set(True)
-    either = changed[:, None] | changed[None, :]
-    fresh = init(capacity=graph.verdict.shape[0])
-    graph = graph.replace(
-        verdict=jnp.where(changed[None, :], UNKNOWN, graph.verdict),
-        transitions=jnp.where(either, 0.0, graph.transitions),
-        error=jnp.where(either, fresh.error, graph.error),
-        stable=graph.stable & ~either,
+    parts = jax.tree.map(inherit, graph)
+    parts = parts.replace(
+        verdict=jnp.where(changed[None, :], UNKNOWN, parts.verdict),
+        transitions=jnp.where(changed[:, None] | changed[None, :], 0.0, parts.transitions),
     )
-    return regions.where(split.done, graph, old)
+    return regions.where(split.done, parts, graph)
+
+
+def _draw_goal(
+    abstraction: Abstraction, region: Array, goals: Goals, *, key: Array
+) -> tuple[tuple[Array, Array], Bool[Array, ""]]:
+    """The box around a random goal inside `region`, and whether there is one."""
+    centre = (goals.lower + goals.upper) / 2
+    inside = jnp.all((abstraction.lower[region] <= centre) & (centre <= abstraction.upper[region]), axis=-1)
+    chance = inside * goals.weight * (1.0 + jax.random.uniform(key, goals.weight.shape))
+    drawn = jnp.argmax(chance)
+    return (goals.lower[drawn], goals.upper[drawn]), chance[drawn] > 0
 
 
 def _examine(
@@ -213,15 +253,15 @@ def _examine(
     abstraction: Abstraction,
     model: ForwardModelState,
     region: Array,
-    target: Array,
+    commanded: tuple[Array, Array],
+    wanted: tuple[Array, Array],
     starts: Array,
     seen: Array,
 ) -> Leaves:
-    goal = (abstraction.lower[target], abstraction.upper[target])
     return reachability.examine(
-        forward_model.network(config.forward_model, model, *goal),
+        forward_model.network(config.forward_model, model, *commanded),
         (abstraction.lower[region], abstraction.upper[region]),
-        goal,
+        wanted,
         starts,
         seen,
         depth=config.refinement.depth,

@@ -34,6 +34,7 @@ class Spec:
     subgoal_scale: tuple[float, ...]
     space: tuple[tuple[float, ...], tuple[float, ...]]
     region_cuts: tuple[tuple[float, ...], ...]
+    success_radius: float
 
     @classmethod
     def of(cls, env: Any) -> Spec:
@@ -47,12 +48,18 @@ class Spec:
             subgoal_scale=tuple(env.subgoal_scale),
             space=(tuple(map(float, env.space[0])), tuple(map(float, env.space[1]))),
             region_cuts=tuple(tuple(cut) for cut in env.region_cuts),
+            success_radius=float(env.success_radius),
         )
 
     @property
     def scale(self) -> Float[Array, "d"]:
         """Half-ranges of the Tutor's subgoals."""
         return jnp.asarray(self.subgoal_scale)
+
+    @property
+    def diameter(self) -> float:
+        """The largest distance in the abstract space."""
+        return float(np.linalg.norm(np.subtract(*self.space)))
 
     def state(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch state"]:
         """The state part of an observation."""
@@ -83,7 +90,7 @@ class TrainState(struct.PyTreeNode):
     """Everything a run knows between two epochs. Environments are reset by every epoch, so they are not part of it."""
 
     commander: CommanderState
-    tutor: learner.State
+    tutor: learner.State | None
     controller: learner.State
     abstraction: Abstraction
     graph: Graph
@@ -99,8 +106,8 @@ def init(config: AgentConfig, spec: Spec, *, key: Array) -> TrainState:
     abstraction = regions.create(spec.space, cuts, max_regions=config.abstraction.max_regions)
     tutor_example, controller_example = _examples(config, spec)
     return TrainState(
-        commander=commander.init(regions=abstraction.capacity),
-        tutor=learner.init(tutor_key, config.tutor, example=tutor_example),
+        commander=commander.init(config.commander, regions=abstraction.capacity),
+        tutor=learner.init(tutor_key, config.tutor, example=tutor_example) if config.tutor.enabled else None,
         controller=learner.init(controller_key, config.controller, example=controller_example),
         abstraction=abstraction,
         graph=refinement.init(capacity=abstraction.capacity),
@@ -144,7 +151,8 @@ def _examples(config: AgentConfig, spec: Spec) -> tuple[Transition, Transition]:
         achieved=jnp.zeros((l + 1, d)),
     )
     extras = trace if config.tutor.off_policy_correction else ()
-    seen_by_controller = controller.observe(jnp.zeros(spec.state_dim), jnp.zeros(d), position=spec.abstract_indices)
+    subgoal = jnp.zeros(d if config.tutor.enabled else 2 * d)
+    seen_by_controller = controller.observe(jnp.zeros(spec.state_dim), subgoal, position=spec.abstract_indices)
     return (
         Transition(obs=seen_by_tutor, action=jnp.zeros(d), next_obs=seen_by_tutor, extras=extras, **rest),
         Transition(obs=seen_by_controller, action=jnp.zeros(spec.action_size), next_obs=seen_by_controller, **rest),

@@ -288,8 +288,11 @@ def _resolve(config: Config, engine: str, spec: Spec) -> Config:
 
 
 def make_env(config: Config, goals: str) -> Any:
-    """The task of `config`: with "test" on its test goals, with "train" on those that the options name, if any."""
-    options = {"goals": goals} | config.env.options if goals == "train" else config.env.options | {"goals": goals}
+    """The task of `config`: on its test goals with "test", as for training with "train"."""
+    if goals == "train":
+        options = {"goals": goals} | config.env.options | config.env.training
+    else:
+        options = config.env.options | {"goals": goals}
     try:
         return envs.make(config.env.name, engine=config.env.engine, **options)
     except envs.EnvError as error:
