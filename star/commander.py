@@ -18,11 +18,15 @@ The probabilities of i' sum to less than 1 where episodes were lost (terminated)
 succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
 region gets there. `prior` decisions weigh as much as this belief.
 
+A share of the environments practises: they pursue random regions instead of the goal, by the same plan with another
+reward, 1 in the region pursued. What is hard to reach, and so unattractive to all others, is tried there.
+
 Source: STAR (ICLR 2024), section 4.1; optimistic model: R-max (Brafman and Tennenholtz 2002).
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 import jax
@@ -47,6 +51,8 @@ class Model(struct.PyTreeNode):
     """Decisions by region, goal region and target."""
     lost: Float[Array, "R R"]
     """Decisions by region and target during which the episode was terminated."""
+    reach: Float[Array, "R R R"]
+    """Values like Q for those who practise: discounted chances of being in the pursued region."""
 
 
 class CommanderState(struct.PyTreeNode):
@@ -61,7 +67,7 @@ class Decision(struct.PyTreeNode):
     """Finished periods of N streams.
 
     `weight` is 1 where the period really lasted k env steps, `lost` is 1 where the task was terminated in it, and
-    `task` is 1 where the goal was that of the task, on which the reward depends, and not a region to practise.
+    `practised` is 1 where a random region was pursued instead of the goal. The reward is that for the goal.
     """
 
     region: Int[Array, "N"]
@@ -71,7 +77,7 @@ class Decision(struct.PyTreeNode):
     next_region: Int[Array, "N"]
     weight: Float[Array, "N"]
     lost: Float[Array, "N"]
-    task: Float[Array, "N"]
+    practised: Float[Array, "N"]
 
 
 class Successors(struct.PyTreeNode):
@@ -84,7 +90,9 @@ class Successors(struct.PyTreeNode):
 def init(config: CommanderConfig, *, regions: int) -> CommanderState:
     """Q = 0 everywhere, optimistic for rewards that are negative, and an empty model."""
     cube = jnp.zeros((regions, regions, regions))
-    model = Model(led=cube, rewards=cube, visits=cube, lost=cube[0]) if config.learner == "model" else None
+    model = None
+    if config.learner == "model":
+        model = Model(led=cube, rewards=cube, visits=cube, lost=cube[0], reach=cube)
     return CommanderState(q=cube, chosen=jnp.zeros(regions), model=model)
 
 
@@ -123,12 +131,20 @@ def act(
     region: Int[Array, "B"],
     goal_region: Int[Array, "B"],
     *,
+    practised: Int[Array, "B"] | None = None,
     epsilon: Float[Array, ""] | float,
     key: Array,
 ) -> Int[Array, "B"]:
-    """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random."""
+    """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random.
+
+    `practised` are regions to pursue instead of the goal where they are not negative.
+    """
     explore_key, random_key, tie_key = jax.random.split(key, 3)
-    best = jnp.where(allowed.greedy[region], state.q[region, goal_region], -jnp.inf)
+    values = state.q[region, goal_region]
+    if practised is not None:
+        reach = state.q if state.model is None else state.model.reach
+        values = jnp.where((practised >= 0)[:, None], reach[region, practised], values)
+    best = jnp.where(allowed.greedy[region], values, -jnp.inf)
     ties = best >= best.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best.shape), -1.0), axis=-1)
     anything = jnp.where(allowed.explore[region], jax.random.uniform(random_key, best.shape), -1.0)
@@ -142,10 +158,10 @@ def observe(config: CommanderConfig, state: CommanderState, allowed: Successors,
     if state.model is None:
         return _q_learning(config, state, allowed, batch)
     cell = (batch.region, batch.goal_region, batch.target)
-    model = Model(
+    model = state.model.replace(
         led=state.model.led.at[batch.region, batch.target, batch.next_region].add(batch.weight),
-        rewards=state.model.rewards.at[cell].add(batch.weight * batch.task * batch.reward),
-        visits=state.model.visits.at[cell].add(batch.weight * batch.task),
+        rewards=state.model.rewards.at[cell].add(batch.weight * batch.reward),
+        visits=state.model.visits.at[cell].add(batch.weight),
         lost=state.model.lost.at[batch.region, batch.target].add(batch.lost),
     )
     return state.replace(model=model)
@@ -173,25 +189,28 @@ def plan(
     arrived = (config.reward == "success") * identity[:, :, None] * identity[:, None]
     reward = (model.rewards + config.prior * (hoped[..., None] + arrived)) / (model.visits + config.prior)
 
-    def sweep(q: Array, _: None) -> tuple[Array, None]:
-        future = _best(q, allowed.greedy)
-        return reward + config.discount * jnp.einsum(
-            "ijn,ng->igj", chances, future, precision=jax.lax.Precision.HIGHEST
-        ), None
+    rewards = jnp.stack([reward, jnp.broadcast_to(identity[..., None], reward.shape)])
 
-    q, _ = jax.lax.scan(sweep, state.q, None, length=config.sweeps)
-    return state.replace(q=q)
+    def sweep(values: Array, _: None) -> tuple[Array, None]:
+        future = jax.vmap(partial(_best, allowed=allowed.greedy))(values)
+        later = jnp.einsum("ijn,vng->vigj", chances, future, precision=jax.lax.Precision.HIGHEST)
+        return rewards + config.discount * later, None
+
+    (q, reach), _ = jax.lax.scan(sweep, jnp.stack([state.q, model.reach]), None, length=config.sweeps)
+    return state.replace(q=q, model=model.replace(reach=reach))
 
 
 def fade(config: CommanderConfig, state: CommanderState) -> CommanderState:
     """Let one epoch pass: the lower levels have learnt, so old decisions count less."""
-    model = state.model and jax.tree.map(lambda x: config.memory * x, state.model)
+    model = state.model
+    if model is not None:
+        model = jax.tree.map(lambda x: config.memory * x, model).replace(reach=model.reach)
     return state.replace(chosen=0.9 * state.chosen, model=model)
 
 
 def measure(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> Metrics:
     """Mean reward of the decisions in `batch` and their mean absolute error of temporal difference."""
-    weight = batch.weight * batch.task
+    weight = batch.weight * (1 - batch.practised)
     n = jnp.maximum(weight.sum(), 1.0)
     error = _td_error(config, state, allowed, batch)
     return {"reward": jnp.sum(batch.reward * weight) / n, "td_error": jnp.sum(jnp.abs(error) * weight) / n}
@@ -200,7 +219,7 @@ def measure(config: CommanderConfig, state: CommanderState, allowed: Successors,
 def _q_learning(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> CommanderState:
     cell = (batch.region, batch.goal_region, batch.target)
     error = _td_error(config, state, allowed, batch)
-    weight = batch.weight * batch.task
+    weight = batch.weight * (1 - batch.practised)
     visits = jnp.zeros_like(state.q).at[cell].add(weight)
     total = jnp.zeros_like(state.q).at[cell].add(weight * error)
     alpha = 1 - (1 - config.learning_rate) ** visits
@@ -257,6 +276,7 @@ def on_split(state: CommanderState, *, parent: Int[Array, ""], child: Int[Array,
             rewards=cells(model.rewards, (0, 1, 2)),
             visits=cells(model.visits, (0, 1, 2)),
             lost=cells(model.lost, (0, 1)),
+            reach=cells(model.reach, (0, 1, 2)),
         )
     return CommanderState(
         q=cells(state.q, (0, 1, 2)), chosen=cells(state.chosen.at[parent].multiply(0.5), (0,)), model=model

@@ -170,8 +170,9 @@ def command(
         act_key, practice_key = jax.random.split(key)
         another = jax.random.randint(practice_key, practice.shape, 0, state.abstraction.count)
         practice = jnp.where((practice == region) | (practice == _ANY), another, practice)
-        goal_region = jnp.where(practice >= 0, practice, goal_region)
-        target = commander.act(state.commander, allowed, region, goal_region, epsilon=epsilon, key=act_key)
+        target = commander.act(
+            state.commander, allowed, region, goal_region, practised=practice, epsilon=epsilon, key=act_key
+        )
     holds_goal = (target == goal_region) & (practice < 0)
     fresh = Streams(
         env=streams.env,

@@ -144,7 +144,7 @@ def _learn_between_episodes(
     periods = num_envs * (spec.episode_length // config.commander.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
     error = forward_model.errors(config.forward_model, state.forward_model, outcome)
-    at_goal = (decision.target == decision.goal_region) & (decision.task > 0)
+    at_goal = (decision.target == decision.goal_region) & (decision.practised == 0)
     counted = outcome.weight * (at_goal == (decision.region == decision.target))
     graph = refinement.observe(
         config, state.graph, region=decision.region, target=decision.target, error=error, weight=counted
@@ -153,7 +153,7 @@ def _learn_between_episodes(
     state = state.replace(forward_model=model, graph=graph)
     refine_metrics: Metrics = {}
     if config.refinement.enabled:
-        goals = refinement.Goals(lower=outcome.lower, upper=outcome.upper, weight=outcome.weight * at_goal)
+        goals = refinement.Goals.of(outcome, at_goal, radius=spec.success_radius)
         state, refine_metrics = refine(config, spec, state, goals, key=refine_key)
     state = state.replace(commander=commander.fade(config.commander, state.commander))
     metrics = (
@@ -238,7 +238,7 @@ def _finished_period(
         next_region=jax.vmap(partial(regions.locate, state.abstraction))(end),
         weight=weight,
         lost=jnp.max(steps.terminated * steps.alive, axis=0),
-        task=(streams.practice < 0).astype(weight.dtype),
+        practised=(streams.practice >= 0).astype(weight.dtype),
     )
     outcome = Outcome(start=streams.start, lower=streams.box.lower, upper=streams.box.upper, end=end, weight=weight)
     return decision, outcome

@@ -10,8 +10,8 @@
         some do:                 cut i along the axis that best parts the reaching from the missing leaves
 
 With `within`, pairs (i, i) are examined too: does a region reach the goals inside it? They count decisions of agents
-in i whose goal lies in i. A goal met of late is drawn, and the square inside its circle of success is the box to
-reach. Only cuts come of it, no verdicts, since the next goal may be another one.
+in i whose goal lies in i. One of their goals is drawn, if possible one that was reached, and the square inside its
+circle of success is the box to reach. Only cuts come of it, no verdicts, since the next goal may be another one.
 
 Source: STAR (ICLR 2024), section 4.3 and algorithm 2.
 """
@@ -29,7 +29,7 @@ from star import abstraction as regions
 from star import forward_model, reachability
 from star.abstraction import Abstraction, Cut
 from star.config import AgentConfig
-from star.forward_model import ForwardModelState
+from star.forward_model import ForwardModelState, Outcome
 from star.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves
 
 Metrics = dict[str, Array]
@@ -56,11 +56,20 @@ class Graph(struct.PyTreeNode):
 
 
 class Goals(struct.PyTreeNode):
-    """Boxes around task goals that were commanded of late; `weight` masks."""
+    """Boxes around task goals that were commanded of late, and whether they were reached; `weight` masks."""
 
     lower: Float[Array, "N d"]
     upper: Float[Array, "N d"]
+    reached: Bool[Array, "N"]
     weight: Float[Array, "N"]
+
+    @classmethod
+    def of(cls, outcome: Outcome, at_goal: Bool[Array, "N"], *, radius: float) -> Goals:
+        """The outcomes commanded `at_goal`; goals count as reached within the square inside the circle of success."""
+        away = jnp.maximum(outcome.lower - outcome.end, outcome.end - outcome.upper)
+        half = (outcome.upper - outcome.lower) / 2
+        reached = jnp.all(away <= _widening(half, radius), axis=-1)
+        return cls(lower=outcome.lower, upper=outcome.upper, reached=reached, weight=outcome.weight * at_goal)
 
 
 def init(*, capacity: int) -> Graph:
@@ -191,7 +200,7 @@ def refine(
             jnp.where(inside, goal[0], abstraction.lower[target]),
             jnp.where(inside, goal[1], abstraction.upper[target]),
         )
-        widened = jnp.maximum(radius / jnp.sqrt(starts.shape[1]) - (goal[1] - goal[0]) / 2, 0.0) * inside
+        widened = _widening((goal[1] - goal[0]) / 2, radius) * inside
         wanted = (commanded[0] - widened, commanded[1] + widened)
         leaves = _examine(config, abstraction, model, region, commanded, wanted, starts, seen)
         verdict = reachability.summary(leaves)
@@ -237,13 +246,18 @@ def on_split(graph: Graph, split: Split) -> Graph:
     return regions.where(split.done, parts, graph)
 
 
+def _widening(half: Float[Array, "*n d"], radius: float) -> Float[Array, "*n d"]:
+    """What a box of half-widths `half` lacks to the cube inside a ball of that radius."""
+    return jnp.maximum(radius / half.shape[-1] ** 0.5 - half, 0.0)
+
+
 def _draw_goal(
     abstraction: Abstraction, region: Array, goals: Goals, *, key: Array
 ) -> tuple[tuple[Array, Array], Bool[Array, ""]]:
-    """The box around a random goal inside `region`, and whether there is one."""
+    """The box around a random goal inside `region`, one that was reached if possible, and whether there is one."""
     centre = (goals.lower + goals.upper) / 2
     inside = jnp.all((abstraction.lower[region] <= centre) & (centre <= abstraction.upper[region]), axis=-1)
-    chance = inside * goals.weight * (1.0 + jax.random.uniform(key, goals.weight.shape))
+    chance = inside * goals.weight * (1.0 + goals.reached + jax.random.uniform(key, goals.weight.shape))
     drawn = jnp.argmax(chance)
     return (goals.lower[drawn], goals.upper[drawn]), chance[drawn] > 0
 

@@ -1,4 +1,4 @@
-"""Tabular Q-learning over regions, against a loop over decisions and cells."""
+"""Q-learning and planning over regions, against loops over decisions and cells."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from star import commander, config
-from star.commander import CommanderState, Decision, Successors
+from star.commander import CommanderState, Decision, Model, Successors
 
 R, N = 5, 40
 
@@ -25,6 +25,8 @@ def random_batch(seed):
         reward=-rng.random(N).astype(np.float32),
         next_region=rng.integers(0, R, N).astype(np.int32),
         weight=(rng.random(N) < 0.7).astype(np.float32),
+        lost=(rng.random(N) < 0.2).astype(np.float32),
+        task=(rng.random(N) < 0.8).astype(np.float32),
     )
 
 
@@ -41,7 +43,7 @@ def slow_update(q, allowed, batch, *, alpha, discount):
     for i, g, j in {*zip(batch.region.tolist(), batch.goal_region.tolist(), batch.target.tolist(), strict=True)}:
         errors = []
         for n in range(N):
-            if batch.weight[n] and (batch.region[n], batch.goal_region[n], batch.target[n]) == (i, g, j):
+            if batch.weight[n] and batch.task[n] and (batch.region[n], batch.goal_region[n], batch.target[n]) == (i, g, j):
                 after = batch.next_region[n]
                 best = max(q[after, g, k] for k in range(R) if allowed[after, k])
                 errors.append(batch.reward[n] + discount * best - q[i, g, j])
@@ -51,36 +53,127 @@ def slow_update(q, allowed, batch, *, alpha, discount):
 
 
 @pytest.fixture(scope="module")
-def update():
-    return jax.jit(commander.update)
+def observe():
+    return jax.jit(commander.observe)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_update_averages_the_errors_of_each_cell(update, seed):
+def test_q_learning_averages_the_errors_of_each_cell(observe, seed):
     state, allowed = random_state(seed)
     batch = random_batch(seed)
-    after, metrics = update(settings(learning_rate=0.1, discount=0.9), state, allowed, batch)
+    chosen = settings(learner="q", learning_rate=0.1, discount=0.9)
+    after = observe(chosen, state, allowed, batch)
     q = np.float64(state.q)
     expected = slow_update(q, np.asarray(allowed.greedy), batch, alpha=0.1, discount=0.9)
     assert (expected != q).sum() > 10
     np.testing.assert_allclose(after.q, expected, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(metrics["reward"], batch.reward[batch.weight > 0].mean(), rtol=1e-5)
 
 
-def test_periods_with_weight_0_teach_nothing(update):
+def test_the_measured_reward_is_that_of_whole_periods_with_the_goal_of_the_task():
     state, allowed = random_state(0)
-    batch = random_batch(0).replace(weight=np.zeros(N, np.float32))
-    np.testing.assert_array_equal(update(settings(), state, allowed, batch)[0].q, state.q)
+    batch = random_batch(0)
+    metrics = commander.measure(settings(), state, allowed, batch)
+    np.testing.assert_allclose(metrics["reward"], batch.reward[batch.weight * batch.task > 0].mean(), rtol=1e-5)
 
 
-def test_a_sweep_is_so_many_updates_on_the_same_batch(update):
-    state, allowed = random_state(1)
-    batch = random_batch(1)
-    chosen = settings(learning_rate=0.1, discount=0.9, sweeps=4)
-    swept, _ = jax.jit(commander.sweep)(chosen, state, allowed, batch)
-    for _ in range(4):
-        state, _ = update(chosen, state, allowed, batch)
-    np.testing.assert_allclose(swept.q, state.q, rtol=1e-5)
+@pytest.mark.parametrize("learner", ["q", "model"])
+def test_periods_with_weight_0_teach_nothing(observe, learner):
+    chosen, (state, allowed) = settings(learner=learner), random_state(0)
+    state = state.replace(model=commander.init(chosen, regions=R).model)
+    nothing = np.zeros(N, np.float32)
+    after = observe(chosen, state, allowed, random_batch(0).replace(weight=nothing, lost=nothing))
+    assert all(jax.tree.leaves(jax.tree.map(lambda a, b: (a == b).all(), after, state)))
+
+
+def slow_plan(batch, allowed, believed, hoped, *, discount, prior, sweeps):
+    """Value iteration from 0 over a model counted decision by decision."""
+    q = np.zeros((R, R, R))
+    led, reward, visits = np.zeros((R, R, R + 1)), np.zeros((R, R, R)), np.zeros((R, R, R))
+    for n in range(N):
+        i, g, j = batch.region[n], batch.goal_region[n], batch.target[n]
+        led[i, j, batch.next_region[n]] += batch.weight[n]
+        led[i, j, R] += batch.lost[n]  # a state that is worth nothing
+        reward[i, g, j] += batch.weight[n] * batch.task[n] * batch.reward[n]
+        visits[i, g, j] += batch.weight[n] * batch.task[n]
+    for _ in range(sweeps):
+        value = np.zeros((R + 1, R))
+        for i in range(R):
+            for g in range(R):
+                value[i, g] = max(q[i, g, j] for j in range(R) if allowed[i, j])
+        for i in range(R):
+            for j in range(R):
+                counts = led[i, j].copy()
+                counts[j if believed[i, j] else i] += prior
+                for g in range(R):
+                    r = reward[i, g, j] + prior * (hoped[i, g] + (i == g == j))
+                    q[i, g, j] = r / (visits[i, g, j] + prior) + discount * counts @ value[:, g] / counts.sum()
+    return q
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
+    rng = np.random.default_rng(seed)
+    chosen = settings(learner="model", reward="success", discount=0.9, prior=2.0, sweeps=3)
+    _, allowed = random_state(seed)
+    batch = random_batch(seed)
+    believed, hoped = rng.random((R, R)) < 0.4, rng.random((R, R)).astype(np.float32)
+    state = observe(chosen, commander.init(chosen, regions=R), allowed, batch)
+    planned = jax.jit(commander.plan)(chosen, state, allowed, believed=jnp.array(believed), hoped=jnp.array(hoped))
+    expected = slow_plan(batch, np.asarray(allowed.greedy), believed, hoped, discount=0.9, prior=2.0, sweeps=3)
+    np.testing.assert_allclose(planned.q, expected, rtol=1e-5)
+
+
+def corridor(batch_of, sweeps=60):
+    """Plans in regions 0-1-2-3 in a row, of which each believes to reach its neighbours."""
+    chosen = settings(learner="model", reward="success", discount=0.9, prior=1.0, sweeps=sweeps)
+    neighbours = np.abs(np.subtract.outer(np.arange(R), np.arange(R))) == 1
+    everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
+    state = commander.init(chosen, regions=R)
+    for batch in batch_of:
+        state = commander.observe(chosen, state, everything, batch)
+    none = jnp.zeros((R, R))
+    return commander.plan(chosen, state, everything, believed=jnp.array(neighbours), hoped=none).q
+
+
+def many(region, target, next_region, *, count=100, lost=0.0):
+    ones = np.ones(count, np.int32)
+    return Decision(
+        region=region * ones,
+        goal_region=4 * ones,
+        target=target * ones,
+        reward=np.zeros(count, np.float32),
+        next_region=next_region * ones,
+        weight=np.float32(1 - lost) * ones,
+        lost=np.float32(lost) * ones,
+        task=np.ones(count, np.float32),
+    )
+
+
+def test_what_was_not_tried_is_believed_and_what_failed_is_not():
+    assert corridor([])[0, 3].argmax() == 1  # 0 -> 1 -> 2 -> 3
+    q = corridor([many(1, 2, 1)])  # a wall between 1 and 2
+    assert q[0, 3].max() < 0.3 * corridor([])[0, 3].max()
+    assert corridor([many(1, 2, 1), many(1, 4, 3)])[1, 3].argmax() == 4  # aiming at 4 leads to 3
+
+
+def test_a_command_that_ends_the_episode_is_worth_less_than_one_that_fails():
+    stays, dies = corridor([many(1, 2, 1)]), corridor([many(1, 2, 1, lost=1.0)])
+    assert dies[1, 3, 2] < stays[1, 3, 2]
+
+
+def test_a_decision_fades_by_the_memory_each_epoch():
+    chosen = settings(learner="model", memory=0.25)
+    state = commander.observe(chosen, commander.init(chosen, regions=R), random_state(0)[1], random_batch(0))
+    faded = commander.fade(chosen, state)
+    for before, after in zip(jax.tree.leaves(state.model), jax.tree.leaves(faded.model), strict=True):
+        np.testing.assert_allclose(after, 0.25 * before)
+
+
+def test_success_is_worth_more_than_any_nearness():
+    chosen = settings(reward="success", nearness=0.2)
+    worth = commander.worth(chosen, jnp.array([0.0, 5.0, 50.0, 3.0]), jnp.array([0.0, 0.0, 0.0, 1.0]), 10.0)
+    np.testing.assert_allclose(worth, [0.2, 0.1, 0.0, 1.14], rtol=1e-6)
+    np.testing.assert_allclose(commander.worth(settings(reward="mean"), jnp.array([5.0]), jnp.array([1.0]), 10.0), [-5])
 
 
 def test_epsilon_falls_linearly_and_stays():
@@ -177,9 +270,14 @@ def test_the_reward_of_a_period_is_the_max_or_mean_over_all_its_steps(reward):
 
 
 def test_a_new_region_inherits_rows_columns_and_half_the_visits_of_its_parent():
-    q = jax.random.normal(jax.random.key(0), (R, R, R))
-    state = CommanderState(q=q, chosen=jnp.arange(1.0, R + 1))
+    q, led = jax.random.uniform(jax.random.key(0), (2, R, R, R))
+    model = Model(led=led, rewards=q, visits=led, lost=q[0])
+    state = CommanderState(q=q, chosen=jnp.arange(1.0, R + 1), model=model)
     after = commander.on_split(state, parent=jnp.int32(1), child=jnp.int32(3))
     who = [0, 1, 2, 1, 4]
+    share = np.where(np.isin(np.arange(R), [1, 3]), 0.5, 1.0)
+    np.testing.assert_allclose(after.model.led, np.asarray(led)[np.ix_(who, who, who)] * share)
+    np.testing.assert_array_equal(after.model.rewards, np.asarray(q)[np.ix_(who, who, who)])
+    np.testing.assert_array_equal(after.model.lost, np.asarray(q[0])[np.ix_(who, who)])
     np.testing.assert_array_equal(after.q, np.asarray(q)[np.ix_(who, who, who)])
     np.testing.assert_array_equal(after.chosen, [1, 1, 3, 1, 5])
