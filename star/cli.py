@@ -20,6 +20,7 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star train configs/point_maze.yaml            train; the result is in runs/point_maze-<time>/
   star train configs/point_maze.yaml --seeds 5  five seeds side by side
   star train configs/ant_maze.yaml --tutor.reward distance --total-env-steps 5000000
+  star train configs/ant_maze.yaml --with configs/agents/hiro.yaml   another agent on the same task
   star train --resume runs/NAME                 go on after an interrupt
   star evaluate runs/NAME                       success on test goals, with 95 % intervals
   star render point_maze --out maze.png         a picture of a task
@@ -71,6 +72,9 @@ def _parser() -> argparse.ArgumentParser:
 
     train = commands.add_parser("train", help="train from a config file", description=_OVERRIDES, **shape)
     train.add_argument("config", nargs="?", type=Path, help="YAML file, such as configs/point_maze.yaml")
+    train.add_argument(
+        "--with", dest="layers", action="append", type=Path, default=[], metavar="FILE", help="YAML laid over CONFIG"
+    )
     train.add_argument("--resume", type=Path, metavar="RUN", help="go on with the run in this directory")
     train.add_argument("--run-dir", type=Path, metavar="DIR", help="where to write (default: runs/CONFIG-TIME)")
     train.add_argument("--seed", dest="trainer.seed", metavar="N", help="first seed")
@@ -171,11 +175,14 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     if options.resume is not None:
         if options.run_dir is not None:
             raise ConfigError("--run-dir: a resumed run stays where it is")
+        if options.layers:
+            raise ConfigError("--with: a resumed run keeps its config file")
         run_dir = options.resume
         config = _run_config(run_dir, overrides)
     else:
-        config = load(options.config, overrides)
-        run_dir = options.run_dir or Path("runs") / f"{options.config.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+        config = load(options.config, overrides, layers=options.layers)
+        name = "-".join(file.stem for file in (options.config, *options.layers))
+        run_dir = options.run_dir or Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
 
     from star import trainer
 

@@ -97,7 +97,7 @@ def init(config: CommanderConfig, *, regions: int) -> CommanderState:
 
 
 def successors(
-    mode: Literal["any", "possible", "known"],
+    mode: Literal["all", "any", "possible", "known"],
     *,
     reaches: Bool[Array, "R R"],
     misses: Bool[Array, "R R"],
@@ -107,11 +107,13 @@ def successors(
 
     Random choices leave out the targets shown unreachable. Greedy ones are made among all targets (`any`), among
     those not shown unreachable (`possible`), or among those shown reachable, if there are any (`known`, published).
-    A region may always be its own target.
+    A region may always be its own target. With `all` nothing is left out.
     """
     pairs = active[:, None] & active[None, :]
     own = jnp.eye(active.shape[0], dtype=bool)
     possible = pairs & (~misses | own)
+    if mode == "all":
+        return Successors(greedy=pairs, explore=pairs)
     if mode != "known":
         return Successors(greedy=pairs if mode == "any" else possible, explore=possible)
     known = pairs & reaches & ~own

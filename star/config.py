@@ -134,8 +134,10 @@ class CommanderConfig(Section):
     practice: float = Field(
         0.25, ge=0, le=1, description="share of environments that practise reaching random regions, one after another"
     )
-    successors: Literal["any", "possible", "known"] = Field(
-        "any", description="greedy choice among all targets, those not shown unreachable, or the known-reachable ones"
+    successors: Literal["all", "any", "possible", "known"] = Field(
+        "any",
+        description="greedy choice among all targets, those not shown unreachable, or the known-reachable ones; "
+        "all disregards reachability in random choices and plans too",
     )
     reward: Literal["success", "mean", "max"] = Field(
         "success", description="of a decision: mean success and nearness of its k env steps, or mean or maximum of r_ext"
@@ -159,6 +161,22 @@ class LevelConfig(Section):
     td3: TD3Config = Field(TD3Config(), description="settings used when learner is td3")
 
 
+class AdjacencyConfig(Section):
+    """The adjacency network of HRAC, which keeps the Tutor from subgoals out of reach."""
+
+    enabled: bool = Field(False, description="true penalises subgoals that are not adjacent, as in HRAC")
+    weight: float = Field(20.0, ge=0, description="of the penalty in the loss of the Tutor's actor")
+    cell: Positive = Field(1, description="side of the cells that states are rounded to (units of the state)")
+    hidden: tuple[Positive, ...] = Field((128, 128, 128), description="widths of the ReLU layers")
+    features: Positive = Field(32, description="size of the embedding")
+    learning_rate: float = Field(2e-4, gt=0, description="Adam step size")
+    near: float = Field(1.0, gt=0, description="adjacent cells are to be no further apart in the embedding")
+    far: float = Field(1.2, gt=0, description="other cells are to be no closer in the embedding")
+    limit: float = Field(1.1, gt=0, description="subgoals no further than this cost nothing")
+    batch_size: Positive = Field(512, description="anchors per update")
+    updates_per_epoch: Positive = Field(200, description="gradient updates after each epoch")
+
+
 class TutorConfig(LevelConfig):
     """The Tutor: chooses the subgoal on the way to the target region."""
 
@@ -168,6 +186,7 @@ class TutorConfig(LevelConfig):
     relative_bounds: bool = Field(True, description="observe the region's bounds relative to the agent")
     off_policy_correction: bool = Field(False, description="relabel replayed subgoals (HIRO); needs learner td3")
     correction_candidates: Positive = Field(10, description="random candidates of the off-policy correction")
+    adjacency: AdjacencyConfig = AdjacencyConfig()
 
     @model_validator(mode="after")
     def _correction_needs_replay(self) -> Self:
@@ -179,6 +198,16 @@ class TutorConfig(LevelConfig):
 class ControllerConfig(LevelConfig):
     """The Controller: drives the joints towards the subgoal."""
 
+    hindsight: bool = Field(
+        False, description="replay half of the transitions with a subgoal that was reached; needs learner td3"
+    )
+
+    @model_validator(mode="after")
+    def _hindsight_needs_replay(self) -> Self:
+        if self.hindsight and self.learner != "td3":
+            raise ValueError("hindsight needs learner td3, which replays old transitions")
+        return self
+
 
 class AbstractionConfig(Section):
     """The regions the Commander chooses from."""
@@ -186,6 +215,9 @@ class AbstractionConfig(Section):
     max_regions: Annotated[int, Field(ge=1, le=1024)] = Field(64, description="capacity of the table of regions")
     cuts: tuple[tuple[float, ...], ...] | None = Field(
         None, description="initial cut positions per abstract dimension; by default those of the task"
+    )
+    grid: tuple[Positive, ...] | None = Field(
+        None, description="instead of cuts: equal initial parts along each abstract dimension, 1 where left out"
     )
     min_width: float = Field(1.0, gt=0, description="no region is cut narrower than this (units of the state)")
 
@@ -199,6 +231,9 @@ class ForwardModelConfig(BufferedConfig):
     buffer_size: Positive = Field(100_000, description="transitions kept")
     updates_per_epoch: Positive = Field(200, description="gradient updates after each epoch")
     residual: bool = Field(True, description="predict the displacement instead of the final state")
+    boxes: Literal["commanded", "reached"] = Field(
+        "commanded", description="train on the box that was commanded, or on the region that was reached"
+    )
 
 
 class RefinementConfig(Section):
@@ -215,6 +250,7 @@ class RefinementConfig(Section):
     depth: Annotated[int, Field(ge=1, le=8)] = Field(5, description="boxes are halved this often: 5 is 1/32")
     min_visits: Positive = Field(100, description="visited start states a reaching box needs")
     pairs_per_epoch: Positive = Field(16, description="pairs examined after each epoch")
+    cuts: Literal["best", "random"] = Field("best", description="where a region is cut; random is for comparison")
     cuts_per_pair: Positive = Field(1, description="cuts one examined pair may make")
     miss_lifetime: Positive = Field(10, description="epochs after which a MISSES verdict is forgotten")
 
@@ -281,14 +317,33 @@ class AgentConfig(Section):
     refinement: RefinementConfig
 
 
-def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
-    """Read a YAML file, apply dotted overrides such as `{"tutor.period": 5}` and validate.
+def load(
+    path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers: Sequence[str | Path] = ()
+) -> Config:
+    """Read a YAML file, lay others over it, apply dotted overrides such as `{"tutor.period": 5}` and validate.
 
     Raises:
       ConfigError: with one line that names the key, the value and what is allowed.
 
     """
-    path = Path(path)
+    values: dict[str, Any] = {}
+    for file in (path, *layers):
+        values = _merged(values, _read(Path(file)))
+    return parse(values, overrides, source=" with ".join(map(str, (path, *layers))))
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """`below` with what `above` says in its place, section by section; task options are replaced as a whole."""
+    merged = dict(below)
+    for key, value in above.items():
+        old = merged.get(key)
+        whole = key in ("options", "training")
+        both = isinstance(old, Mapping) and isinstance(value, Mapping) and not whole
+        merged[key] = _merged(old, value) if both else value
+    return merged
+
+
+def _read(path: Path) -> dict[str, Any]:
     try:
         values = read_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -305,7 +360,7 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config
         values = {}
     if not isinstance(values, dict):
         raise ConfigError(f"{path}: should hold sections such as `trainer:`, not {_show(values)}")
-    return parse(values, overrides, source=str(path))
+    return values
 
 
 class _UniqueKeys(yaml.SafeLoader):

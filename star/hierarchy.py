@@ -25,12 +25,12 @@ from jaxtyping import Array, Float
 
 from envs.vector import VectorEnv
 from star import abstraction as regions
-from star import commander, controller, episode, forward_model, learner, refinement, tutor
+from star import adjacency, commander, controller, episode, forward_model, learner, refinement, tutor
 from star.commander import CommanderState, Decision, Successors
 from star.config import AgentConfig
 from star.episode import Episode, Steps, Streams
 from star.forward_model import Outcome
-from star.replay import Transition
+from star.replay import Penalty, Transition
 from star.state import Spec, TrainState
 from star.tutor import Trace
 
@@ -50,6 +50,10 @@ def epoch(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState) ->
     )
     metrics = jax.tree.map(jnp.mean, metrics) | jax.tree.map(jnp.sum, counts)
     metrics |= _episode_metrics("train", streams.episode, streams.practice < 0)
+    if state.adjacency is not None:
+        end_key, near_key = jax.random.split(end_key)
+        near, more = adjacency.train(config.tutor.adjacency, state.adjacency, spec.space, key=near_key)
+        state, metrics = state.replace(adjacency=near), metrics | _prefix("adjacency", more)
     outcomes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), outcomes)
     if config.commander.enabled:
         epsilon = commander.epsilon(config.commander, _env_steps(spec, env, state))
@@ -70,7 +74,14 @@ def _block(
     metrics = jax.tree.map(jnp.mean, metrics)
     if config.tutor.enabled:
         relabel = _relabel(config, spec, state) if config.tutor.off_policy_correction else None
-        learnt, more = learner.update(config.tutor, state.tutor, decisions, relabel=relabel, key=update_key)
+        learnt, more = learner.update(
+            config.tutor,
+            state.tutor,
+            decisions,
+            relabel=relabel,
+            penalty=_penalty(config, spec, state) if config.tutor.adjacency.enabled else None,
+            key=update_key,
+        )
         state, metrics = state.replace(tutor=learnt), metrics | _prefix("tutor", more)
     return (state, streams), (outcomes, metrics, counts)
 
@@ -91,8 +102,9 @@ def _segment(
     streams, steps = episode.rollout(config, spec, env, state, streams, subgoal, deterministic=False, key=rollout_key)
 
     experience = _controller_rollout(config, spec, steps)
+    in_hindsight = partial(_in_hindsight, config, spec) if config.controller.hindsight else None
     controller_state, controller_metrics = learner.update(
-        config.controller, state.controller, experience, key=update_key
+        config.controller, state.controller, experience, relabel=in_hindsight, key=update_key
     )
     metrics = _prefix(
         "controller", controller_metrics | {"reward": _weighted(experience.reward, experience.weight)}
@@ -105,6 +117,10 @@ def _segment(
     if tutor_action is not None:
         transition = _tutor_transition(config, spec, streams, began, tutor_action, steps)
         metrics |= {"tutor/reward": transition.reward.mean()}
+    if state.adjacency is not None:
+        path = spec.abstract(jnp.concatenate([began[None], steps.next_obs]))
+        near = adjacency.observe(config.tutor.adjacency, state.adjacency, spec.space, path, steps.alive)
+        state = state.replace(adjacency=near)
     counts = {
         f"env/{name}": (value * steps.alive).sum()
         for name, value in (
@@ -124,7 +140,9 @@ def _command_better(
     learnt = commander.observe(config.commander, state.commander, allowed, decision)
     if learnt.model is None:
         return learnt
-    believed = state.graph.reaches | (regions.adjacent(state.abstraction) & ~state.graph.misses)
+    believed = regions.adjacent(state.abstraction)
+    if config.commander.successors != "all":
+        believed = state.graph.reaches | (believed & ~state.graph.misses)
     centre = regions.centre(state.abstraction)
     apart = jnp.linalg.norm(centre[:, None] - centre, axis=-1)
     hoped = commander.worth(config.commander, apart, 0.0, spec.diameter)
@@ -143,6 +161,9 @@ def _learn_between_episodes(
     )
     periods = num_envs * (spec.episode_length // config.commander.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
+    if config.forward_model.boxes == "reached":
+        lower, upper = (corner[decision.next_region] for corner in (state.abstraction.lower, state.abstraction.upper))
+        outcome = outcome.replace(lower=lower, upper=upper)
     error = forward_model.errors(config.forward_model, state.forward_model, outcome)
     at_goal = (decision.target == decision.goal_region) & (decision.practised == 0)
     counted = outcome.weight * (at_goal == (decision.region == decision.target))
@@ -194,6 +215,31 @@ def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transi
         terminated=steps.terminated,
         cut=jnp.maximum(last, steps.ended),
         weight=steps.alive,
+        extras=_later(spec, steps) if config.controller.hindsight else (),
+    )
+
+
+def _later(spec: Spec, steps: Steps) -> Float[Array, "l B 2 d"]:
+    """Where the agent was at the end of the segment, seen from before and from after each of its env steps."""
+    before, after = spec.abstract(steps.obs), spec.abstract(steps.next_obs)
+    return jnp.stack([after[-1] - before, after[-1] - after], axis=-2)
+
+
+def _in_hindsight(config: AgentConfig, spec: Spec, batch: Transition, key: Array) -> Transition:
+    """Half of the replayed transitions as if what the agent reached had been its subgoal (Andrychowicz et al. 2017)."""
+    d = len(spec.abstract_indices)
+    size = d if config.tutor.enabled else 2 * d
+    reached = jnp.concatenate([batch.extras] * (size // d), axis=-1)
+    before, after = reached[:, 0], reached[:, 1]
+    replaced = jax.random.bernoulli(key, 0.5, batch.reward.shape)
+
+    def pick(new: Array, old: Array) -> Array:
+        return jnp.where(replaced.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
+
+    return batch.replace(
+        obs=pick(batch.obs.at[:, -size:].set(before), batch.obs),
+        next_obs=pick(batch.next_obs.at[:, -size:].set(after), batch.next_obs),
+        reward=pick(controller.reward(config.controller, before, after, size=d), batch.reward),
     )
 
 
@@ -206,7 +252,7 @@ def _tutor_transition(
     achieved = spec.abstract(path)
     distances = jnp.linalg.norm(achieved - streams.box.centre, axis=-1)
     terminated, ended = (jnp.max(flag * steps.alive, axis=0) for flag in (steps.terminated, steps.ended))
-    extras: Any = ()
+    extras: Any = achieved[0] if config.tutor.adjacency.enabled else ()
     if config.tutor.off_policy_correction:
         swap = partial(jnp.swapaxes, axis1=0, axis2=1)
         extras = Trace(states=swap(spec.state(steps.obs)), actions=swap(steps.action), achieved=swap(achieved))
@@ -217,7 +263,7 @@ def _tutor_transition(
         reward=tutor.reward(config.tutor, distances, steps.alive),
         next_obs=observe(spec.state(end), spec.abstract(end), streams.box),
         terminated=terminated,
-        cut=jnp.maximum(streams.clock == 0, ended),
+        cut=jnp.maximum(streams.clock == 0, ended) if config.commander.enabled else ended,
         weight=jnp.ones_like(terminated),
         extras=extras,
     )
@@ -262,6 +308,18 @@ def _relabel(config: AgentConfig, spec: Spec, state: TrainState) -> Any:
         return tutor.correct(config.tutor, batch, spec.scale, mean_action, key=key)
 
     return relabel
+
+
+def _penalty(config: AgentConfig, spec: Spec, state: TrainState) -> Penalty:
+    """The price of subgoals that are not adjacent to where they are set."""
+
+    def price(batch: Transition, action: Array) -> Array:
+        start = batch.extras.achieved[..., 0, :] if config.tutor.off_policy_correction else batch.extras
+        return adjacency.penalty(
+            config.tutor.adjacency, state.adjacency, start, tutor.subgoal(action, spec.scale)
+        )
+
+    return price
 
 
 def _env_steps(spec: Spec, env: VectorEnv, state: TrainState) -> Float[Array, ""]:

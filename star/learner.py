@@ -7,7 +7,7 @@ A learner is a module with three functions:
     update(config, state, rollout, *, key)                -> state, metrics
 
 `update` sees a rollout [T, B] of `star.replay.Transition`. An off-policy learner also takes `relabel`, applied to
-every batch it replays.
+every batch it replays. Every learner takes `penalty`, which prices the actor's action in a transition.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from star import ppo, td3
 from star.config import LevelConfig
-from star.replay import Transition
+from star.replay import Penalty, Transition
 
 State = ppo.PPOState | td3.TD3State
 Metrics = dict[str, Array]
@@ -41,9 +41,15 @@ def act(
 
 
 def update(
-    config: LevelConfig, state: Any, rollout: Transition, *, relabel: td3.Relabel | None = None, key: Array
+    config: LevelConfig,
+    state: Any,
+    rollout: Transition,
+    *,
+    relabel: td3.Relabel | None = None,
+    penalty: Penalty | None = None,
+    key: Array,
 ) -> tuple[Any, Metrics]:
     """Learn from a rollout [T, B]; `relabel` is used by learners that replay old transitions."""
     if config.learner == "ppo":
-        return ppo.update(config.ppo, state, rollout, key=key)
-    return td3.update(config.td3, state, rollout, relabel=relabel, key=key)
+        return ppo.update(config.ppo, state, rollout, penalty=penalty, key=key)
+    return td3.update(config.td3, state, rollout, relabel=relabel, penalty=penalty, key=key)

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from star.config import PPOConfig
 from star.networks import MLP, Normalizer, apply
-from star.replay import Transition, flatten
+from star.replay import Penalty, Transition, flatten
 
 Metrics = dict[str, Array]
 
@@ -40,6 +40,7 @@ class PPOState(struct.PyTreeNode):
 
 
 class _Sample(struct.PyTreeNode):
+    transition: Transition | None
     obs: Array
     action: Array
     log_prob: Array
@@ -85,15 +86,20 @@ def act(
     return mean if deterministic else mean + std * jax.random.normal(key, mean.shape)
 
 
-def update(config: PPOConfig, state: PPOState, rollout: Transition, *, key: Array) -> tuple[PPOState, Metrics]:
-    """Learn from one rollout [T, B] that `state` itself has collected."""
-    samples = _prepare(config, state, rollout)
+def update(
+    config: PPOConfig, state: PPOState, rollout: Transition, *, penalty: Penalty | None = None, key: Array
+) -> tuple[PPOState, Metrics]:
+    """Learn from one rollout [T, B] that `state` itself has collected.
+
+    `penalty(batch, action)` [N] is added to the loss of the actor whose mean is `action`.
+    """
+    samples = _prepare(config, state, rollout, keep=penalty is not None)
 
     def one_pass(carry: tuple, pass_key: Array) -> tuple[tuple, Metrics]:
         params, optimizer, learning_rate = carry
         batches = _minibatches(samples, config.minibatches, key=pass_key)
         (params, optimizer), metrics = jax.lax.scan(
-            partial(_gradient_step, config, learning_rate), (params, optimizer), batches
+            partial(_gradient_step, config, penalty, learning_rate), (params, optimizer), batches
         )
         metrics = jax.tree.map(jnp.mean, metrics)
         return (params, optimizer, _adapt(config, learning_rate, metrics["kl"])), metrics
@@ -143,13 +149,17 @@ def _log_prob(mean: Array, std: Array, action: Array) -> Array:
     return jnp.sum(-0.5 * jnp.square((action - mean) / std) - jnp.log(std), axis=-1)
 
 
-def _prepare(config: PPOConfig, state: PPOState, rollout: Transition) -> _Sample:
-    """The rollout as independent samples [T * B], seen through the networks that collected it."""
+def _prepare(config: PPOConfig, state: PPOState, rollout: Transition, *, keep: bool) -> _Sample:
+    """The rollout as independent samples [T * B], seen through the networks that collected it.
+
+    With `keep` the samples hold their transition too.
+    """
     obs, next_obs = state.normalizer(rollout.obs), state.normalizer(rollout.next_obs)
     values = _value(config, state.params, obs)
     advantage = advantages(config, rollout, values, _value(config, state.params, next_obs))
     mean, std = _policy(config, state.params, obs)
     sample = _Sample(
+        transition=rollout if keep else None,
         obs=obs,
         action=rollout.action,
         log_prob=_log_prob(mean, std, rollout.action),
@@ -165,15 +175,19 @@ def _minibatches(samples: _Sample, count: int, *, key: Array) -> _Sample:
     return jax.tree.map(lambda x: x[order].reshape(count, -1, *x.shape[1:]), samples)
 
 
-def _gradient_step(config: PPOConfig, learning_rate: Array, carry: tuple, batch: _Sample) -> tuple[tuple, Metrics]:
+def _gradient_step(
+    config: PPOConfig, penalty: Penalty | None, learning_rate: Array, carry: tuple, batch: _Sample
+) -> tuple[tuple, Metrics]:
     params, optimizer = carry
-    gradient, metrics = jax.grad(partial(_loss, config), has_aux=True)(params, batch)
+    gradient, metrics = jax.grad(partial(_loss, config, penalty), has_aux=True)(params, batch)
     step, optimizer = _optimizer(config).update(gradient, optimizer)
     params = jax.tree.map(lambda p, s: p - learning_rate * s, params, step)
     return (params, optimizer), metrics
 
 
-def _loss(config: PPOConfig, params: Mapping[str, Any], batch: _Sample) -> tuple[Array, Metrics]:
+def _loss(
+    config: PPOConfig, penalty: Penalty | None, params: Mapping[str, Any], batch: _Sample
+) -> tuple[Array, Metrics]:
     share = batch.weight / jnp.maximum(batch.weight.sum(), 1.0)
     centred = batch.advantage - jnp.sum(share * batch.advantage)
     advantage = centred / (jnp.sqrt(jnp.sum(share * jnp.square(centred))) + 1e-8)
@@ -182,7 +196,8 @@ def _loss(config: PPOConfig, params: Mapping[str, Any], batch: _Sample) -> tuple
     log_ratio = _log_prob(mean, std, batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
-    actor_loss = -jnp.sum(share * jnp.minimum(ratio * advantage, clipped * advantage))
+    price = penalty(batch.transition, mean) if penalty is not None else 0.0
+    actor_loss = jnp.sum(share * (price - jnp.minimum(ratio * advantage, clipped * advantage)))
     critic_loss = 0.5 * jnp.sum(share * jnp.square(_value(config, params, batch.obs) - batch.target))
     entropy = jnp.sum(jnp.log(std)) + 0.5 * std.shape[0] * jnp.log(2 * jnp.pi * jnp.e)
     metrics = {

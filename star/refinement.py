@@ -126,13 +126,18 @@ def due(config: AgentConfig, graph: Graph, active: Bool[Array, "R"]) -> Bool[Arr
 
 
 def best_cut(
-    abstraction: Abstraction, candidates: Bool[Array, "R"], leaves: Leaves, *, min_width: float | Array
+    abstraction: Abstraction,
+    candidates: Bool[Array, "R"],
+    leaves: Leaves,
+    *,
+    min_width: float | Array,
+    key: Array | None = None,
 ) -> tuple[Cut, Float[Array, ""]]:
     """The cut of one of the `candidates` that best parts reaching from missing leaves, and what it gains.
 
     The gain is the decrease of Gini impurity, as in a decision tree: the impurity of a part with volume v, of which r
     reaches, is r (v - r) / v; it is given as a share of the volume of all leaves. Cuts lie on leaf boundaries and
-    leave both parts at least `min_width` wide.
+    leave both parts at least `min_width` wide. With `key` one of these cuts is drawn at random instead.
     """
     positions = leaves.upper.T
     volume = jnp.prod(leaves.upper - leaves.lower, axis=-1)
@@ -151,6 +156,9 @@ def best_cut(
         below = overlap(lower, upper.at[dimension].set(jnp.minimum(position, upper[dimension])))
         whole = overlap(lower, upper)
         decrease = impurity(whole) - impurity(below) - impurity(whole - below)
+        if key is not None:
+            inside = (below.sum() > 0) & (below.sum() < whole.sum())
+            decrease = inside * volume.sum()
         return jnp.where(wide & candidates[region], decrease / volume.sum(), 0.0)
 
     d, count = positions.shape
@@ -158,6 +166,8 @@ def best_cut(
     over_positions = jax.vmap(gain, in_axes=(None, None, 0))
     over_dimensions = jax.vmap(over_positions, in_axes=(None, 0, 0))
     gains = jax.vmap(over_dimensions, in_axes=(0, None, None))(every_region, every_dimension, positions)
+    if key is not None:
+        gains *= jax.random.uniform(key, gains.shape, minval=0.5)
     best = jnp.argmax(gains)
     region, dimension, index = jnp.unravel_index(best, (abstraction.capacity, d, count))
     return Cut(region=region, dimension=dimension, position=positions[dimension, index]), gains.reshape(-1)[best]
@@ -188,12 +198,13 @@ def refine(
     graph = forget(config, graph)
     starts, seen = forward_model.visited(model)
 
-    def one_pair(carry: tuple[Abstraction, Graph], goal_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
+    def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
         abstraction, graph = carry
         waiting = due(config, graph, abstraction.active)
         region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, graph.transitions, -1.0)), waiting.shape)
         found = waiting[region, target]
         inside = region == target
+        goal_key, cut_key = jax.random.split(pair_key)
         goal, there = _draw_goal(abstraction, region, goals, key=goal_key)
         judged = found & (~inside | there)
         commanded = (
@@ -213,7 +224,7 @@ def refine(
             ),
         )
         mixed = judged & (verdict == MIXED)
-        abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed)
+        abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed, key=cut_key)
         return (abstraction, graph), (splits, found, mixed)
 
     (abstraction, graph), (splits, found, mixed) = jax.lax.scan(
@@ -286,14 +297,22 @@ def _examine(
 
 
 def _cut(
-    config: AgentConfig, abstraction: Abstraction, graph: Graph, region: Array, leaves: Leaves, mixed: Array
+    config: AgentConfig,
+    abstraction: Abstraction,
+    graph: Graph,
+    region: Array,
+    leaves: Leaves,
+    mixed: Array,
+    *,
+    key: Array,
 ) -> tuple[Abstraction, Graph, Split]:
     """Up to `cuts_per_pair` cuts of `region` and of the parts cut from it, best first."""
 
-    def one_cut(carry: tuple, _: None) -> tuple[tuple, Split]:
+    def one_cut(carry: tuple, cut_key: Array) -> tuple[tuple, Split]:
         abstraction, graph, parts = carry
         min_width = config.abstraction.min_width
-        cut, gain = best_cut(abstraction, parts, leaves, min_width=min_width)
+        random = cut_key if config.refinement.cuts == "random" else None
+        cut, gain = best_cut(abstraction, parts, leaves, min_width=min_width, key=random)
         child = abstraction.count
         after, possible = regions.split(abstraction, cut, min_width=min_width)
         split = Split(
@@ -305,6 +324,6 @@ def _cut(
 
     parts = jnp.zeros(abstraction.capacity, bool).at[region].set(True)
     (abstraction, graph, _), splits = jax.lax.scan(
-        one_cut, (abstraction, graph, parts), None, length=config.refinement.cuts_per_pair
+        one_cut, (abstraction, graph, parts), jax.random.split(key, config.refinement.cuts_per_pair)
     )
     return abstraction, graph, splits

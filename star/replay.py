@@ -5,6 +5,7 @@ The rings are flashbax item buffers; the functions here add masked batches to th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import flashbax
@@ -31,6 +32,10 @@ class Transition(struct.PyTreeNode):
     cut: Float[Array, "*batch"]
     weight: Float[Array, "*batch"]
     extras: Any = ()
+
+
+Penalty = Callable[[Transition, Array], Array]
+"""The price [N] of actions [N, act] that an actor would take in a batch of transitions."""
 
 
 def flatten(batch: Any) -> Any:

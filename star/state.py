@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,8 +13,9 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from star import abstraction as regions
-from star import commander, controller, forward_model, learner, refinement
+from star import adjacency, commander, controller, forward_model, learner, refinement
 from star.abstraction import Abstraction
+from star.adjacency import AdjacencyState
 from star.commander import CommanderState
 from star.config import AgentConfig, Config
 from star.forward_model import ForwardModelState
@@ -91,6 +93,7 @@ class TrainState(struct.PyTreeNode):
 
     commander: CommanderState
     tutor: learner.State | None
+    adjacency: AdjacencyState | None
     controller: learner.State
     abstraction: Abstraction
     graph: Graph
@@ -101,13 +104,14 @@ class TrainState(struct.PyTreeNode):
 
 def init(config: AgentConfig, spec: Spec, *, key: Array) -> TrainState:
     """A fresh run."""
-    tutor_key, controller_key, model_key, key = jax.random.split(key, 4)
-    cuts = spec.region_cuts if config.abstraction.cuts is None else config.abstraction.cuts
-    abstraction = regions.create(spec.space, cuts, max_regions=config.abstraction.max_regions)
+    tutor_key, controller_key, model_key, adjacency_key, key = jax.random.split(key, 5)
+    adjacent = config.tutor.adjacency
+    abstraction = regions.create(spec.space, first_cuts(config, spec), max_regions=config.abstraction.max_regions)
     tutor_example, controller_example = _examples(config, spec)
     return TrainState(
         commander=commander.init(config.commander, regions=abstraction.capacity),
         tutor=learner.init(tutor_key, config.tutor, example=tutor_example) if config.tutor.enabled else None,
+        adjacency=adjacency.init(adjacency_key, adjacent, spec.space) if adjacent.enabled else None,
         controller=learner.init(controller_key, config.controller, example=controller_example),
         abstraction=abstraction,
         graph=refinement.init(capacity=abstraction.capacity),
@@ -115,6 +119,16 @@ def init(config: AgentConfig, spec: Spec, *, key: Array) -> TrainState:
         epoch=jnp.zeros((), jnp.int32),
         key=key,
     )
+
+
+def first_cuts(config: AgentConfig | Config, spec: Spec) -> Sequence[Sequence[float]]:
+    """Where the abstract space is cut at first: as the task says, or `abstraction.cuts`, or `abstraction.grid`."""
+    if config.abstraction.grid is None:
+        return spec.region_cuts if config.abstraction.cuts is None else config.abstraction.cuts
+    parts = (*config.abstraction.grid, *[1] * (len(spec.abstract_indices) - len(config.abstraction.grid)))
+    return [
+        np.linspace(low, high, n + 1)[1:-1].tolist() for n, low, high in zip(parts, *spec.space, strict=False)
+    ]
 
 
 def check(config: Config, spec: Spec) -> None:
@@ -126,6 +140,13 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(f"tutor.unroll: {config.tutor.unroll} does not divide the {segments} decisions of an episode")
     if config.commander.period > spec.episode_length:
         raise ValueError(f"commander.period: {config.commander.period} exceeds the episode of {spec.episode_length}")
+    cells = int(np.prod(adjacency.shape(config.tutor.adjacency, spec.space)))
+    if config.tutor.adjacency.enabled and cells > adjacency.MAX_CELLS:
+        raise ValueError(
+            f"tutor.adjacency.cell: {config.tutor.adjacency.cell} makes {cells} cells, more than {adjacency.MAX_CELLS}"
+        )
+    if len(config.abstraction.grid or ()) > len(spec.abstract_indices):
+        raise ValueError(f"abstraction.grid: {list(config.abstraction.grid)} has more than the {len(spec.abstract_indices)} abstract dimensions")
     for name, section, decisions in (
         ("tutor", config.tutor, config.tutor.unroll),
         ("controller", config.controller, config.tutor.period),
@@ -133,9 +154,8 @@ def check(config: Config, spec: Spec) -> None:
         rollout = decisions * config.trainer.num_envs
         if section.learner == "td3" and section.td3.buffer_size < rollout:
             raise ValueError(f"{name}.td3.buffer_size: {section.td3.buffer_size} is below one rollout of {rollout}")
-    cuts = spec.region_cuts if config.abstraction.cuts is None else config.abstraction.cuts
     try:
-        regions.create(spec.space, cuts, max_regions=config.abstraction.max_regions)
+        regions.create(spec.space, first_cuts(config, spec), max_regions=config.abstraction.max_regions)
     except ValueError as error:
         raise ValueError(f"abstraction.cuts: {error}") from None
 
@@ -145,15 +165,25 @@ def _examples(config: AgentConfig, spec: Spec) -> tuple[Transition, Transition]:
     d, l, scalar = len(spec.abstract_indices), config.tutor.period, jnp.zeros(())
     rest = {"reward": scalar, "terminated": scalar, "cut": scalar, "weight": scalar}
     seen_by_tutor = jnp.zeros(spec.state_dim + 2 * d)
+    extras: Any = ()
+    if config.tutor.adjacency.enabled:
+        extras = jnp.zeros(d)
     trace = Trace(
         states=jnp.zeros((l, spec.state_dim)),
         actions=jnp.zeros((l, spec.action_size)),
         achieved=jnp.zeros((l + 1, d)),
     )
-    extras = trace if config.tutor.off_policy_correction else ()
+    if config.tutor.off_policy_correction:
+        extras = trace
     subgoal = jnp.zeros(d if config.tutor.enabled else 2 * d)
     seen_by_controller = controller.observe(jnp.zeros(spec.state_dim), subgoal, position=spec.abstract_indices)
     return (
         Transition(obs=seen_by_tutor, action=jnp.zeros(d), next_obs=seen_by_tutor, extras=extras, **rest),
-        Transition(obs=seen_by_controller, action=jnp.zeros(spec.action_size), next_obs=seen_by_controller, **rest),
+        Transition(
+            obs=seen_by_controller,
+            action=jnp.zeros(spec.action_size),
+            next_obs=seen_by_controller,
+            extras=jnp.zeros((2, d)) if config.controller.hindsight else (),
+            **rest,
+        ),
     )

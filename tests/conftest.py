@@ -130,7 +130,7 @@ def record(agent, spec, env, state, key):
         return episode.restart_ended(env, advanced, steps, key=reset_key), saved
 
     start_key, scan_key = jax.random.split(key)
-    streams = episode.start(spec, env, state.abstraction, key=start_key)
+    streams = episode.start(spec, env, practice=0.6, key=start_key)
     keys = jax.random.split(scan_key, spec.episode_length // agent.tutor.period)
     last, saved = jax.lax.scan(segment, streams, keys)
     return last, saved
@@ -155,10 +155,12 @@ def recording(request, breaking_env):
         state = star.state.init(agent, spec, key=key)
         # Greedy choices often fall on the goal's own region.
         eye = jnp.eye(state.abstraction.capacity)
-        state = state.replace(commander=state.commander.replace(q=jnp.broadcast_to(eye, state.commander.q.shape)))
+        q = jnp.broadcast_to(eye, state.commander.q.shape)
+        known = state.commander.replace(q=q, model=state.commander.model.replace(reach=q))
+        state = state.replace(commander=known)
         return state.abstraction, record(agent, spec, breaking_env, state, key)
 
-    abstraction, (last, saved) = to_numpy(jax.jit(whole)(jax.random.key(1)))
+    abstraction, (last, saved) = to_numpy(jax.jit(whole)(jax.random.key(2)))
     return SimpleNamespace(config=parsed, spec=spec, abstraction=abstraction, last=last, published=published, **saved)
 
 

@@ -26,7 +26,7 @@ def random_batch(seed):
         next_region=rng.integers(0, R, N).astype(np.int32),
         weight=(rng.random(N) < 0.7).astype(np.float32),
         lost=(rng.random(N) < 0.2).astype(np.float32),
-        task=(rng.random(N) < 0.8).astype(np.float32),
+        practised=(rng.random(N) < 0.2).astype(np.float32),
     )
 
 
@@ -43,7 +43,7 @@ def slow_update(q, allowed, batch, *, alpha, discount):
     for i, g, j in {*zip(batch.region.tolist(), batch.goal_region.tolist(), batch.target.tolist(), strict=True)}:
         errors = []
         for n in range(N):
-            if batch.weight[n] and batch.task[n] and (batch.region[n], batch.goal_region[n], batch.target[n]) == (i, g, j):
+            if batch.weight[n] and not batch.practised[n] and (batch.region[n], batch.goal_region[n], batch.target[n]) == (i, g, j):
                 after = batch.next_region[n]
                 best = max(q[after, g, k] for k in range(R) if allowed[after, k])
                 errors.append(batch.reward[n] + discount * best - q[i, g, j])
@@ -73,7 +73,7 @@ def test_the_measured_reward_is_that_of_whole_periods_with_the_goal_of_the_task(
     state, allowed = random_state(0)
     batch = random_batch(0)
     metrics = commander.measure(settings(), state, allowed, batch)
-    np.testing.assert_allclose(metrics["reward"], batch.reward[batch.weight * batch.task > 0].mean(), rtol=1e-5)
+    np.testing.assert_allclose(metrics["reward"], batch.reward[batch.weight > batch.practised].mean(), rtol=1e-5)
 
 
 @pytest.mark.parametrize("learner", ["q", "model"])
@@ -86,20 +86,21 @@ def test_periods_with_weight_0_teach_nothing(observe, learner):
 
 
 def slow_plan(batch, allowed, believed, hoped, *, discount, prior, sweeps):
-    """Value iteration from 0 over a model counted decision by decision."""
-    q = np.zeros((R, R, R))
+    """Value iteration from 0 over a model counted decision by decision: for the goals, and to be in their region."""
+    q, reach = np.zeros((2, R, R, R))
     led, reward, visits = np.zeros((R, R, R + 1)), np.zeros((R, R, R)), np.zeros((R, R, R))
     for n in range(N):
         i, g, j = batch.region[n], batch.goal_region[n], batch.target[n]
         led[i, j, batch.next_region[n]] += batch.weight[n]
         led[i, j, R] += batch.lost[n]  # a state that is worth nothing
-        reward[i, g, j] += batch.weight[n] * batch.task[n] * batch.reward[n]
-        visits[i, g, j] += batch.weight[n] * batch.task[n]
+        reward[i, g, j] += batch.weight[n] * batch.reward[n]
+        visits[i, g, j] += batch.weight[n]
     for _ in range(sweeps):
-        value = np.zeros((R + 1, R))
+        value, chance = np.zeros((2, R + 1, R))
         for i in range(R):
             for g in range(R):
                 value[i, g] = max(q[i, g, j] for j in range(R) if allowed[i, j])
+                chance[i, g] = max(reach[i, g, j] for j in range(R) if allowed[i, j])
         for i in range(R):
             for j in range(R):
                 counts = led[i, j].copy()
@@ -107,7 +108,8 @@ def slow_plan(batch, allowed, believed, hoped, *, discount, prior, sweeps):
                 for g in range(R):
                     r = reward[i, g, j] + prior * (hoped[i, g] + (i == g == j))
                     q[i, g, j] = r / (visits[i, g, j] + prior) + discount * counts @ value[:, g] / counts.sum()
-    return q
+                    reach[i, g, j] = (i == g) + discount * counts @ chance[:, g] / counts.sum()
+    return q, reach
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -119,8 +121,9 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     believed, hoped = rng.random((R, R)) < 0.4, rng.random((R, R)).astype(np.float32)
     state = observe(chosen, commander.init(chosen, regions=R), allowed, batch)
     planned = jax.jit(commander.plan)(chosen, state, allowed, believed=jnp.array(believed), hoped=jnp.array(hoped))
-    expected = slow_plan(batch, np.asarray(allowed.greedy), believed, hoped, discount=0.9, prior=2.0, sweeps=3)
-    np.testing.assert_allclose(planned.q, expected, rtol=1e-5)
+    q, reach = slow_plan(batch, np.asarray(allowed.greedy), believed, hoped, discount=0.9, prior=2.0, sweeps=3)
+    np.testing.assert_allclose(planned.q, q, rtol=1e-5)
+    np.testing.assert_allclose(planned.model.reach, reach, rtol=1e-5)
 
 
 def corridor(batch_of, sweeps=60):
@@ -145,7 +148,7 @@ def many(region, target, next_region, *, count=100, lost=0.0):
         next_region=next_region * ones,
         weight=np.float32(1 - lost) * ones,
         lost=np.float32(lost) * ones,
-        task=np.ones(count, np.float32),
+        practised=np.zeros(count, np.float32),
     )
 
 
@@ -165,8 +168,8 @@ def test_a_decision_fades_by_the_memory_each_epoch():
     chosen = settings(learner="model", memory=0.25)
     state = commander.observe(chosen, commander.init(chosen, regions=R), random_state(0)[1], random_batch(0))
     faded = commander.fade(chosen, state)
-    for before, after in zip(jax.tree.leaves(state.model), jax.tree.leaves(faded.model), strict=True):
-        np.testing.assert_allclose(after, 0.25 * before)
+    for name in ("led", "rewards", "visits", "lost"):
+        np.testing.assert_allclose(getattr(faded.model, name), 0.25 * getattr(state.model, name))
 
 
 def test_success_is_worth_more_than_any_nearness():
@@ -254,6 +257,21 @@ def test_epsilon_is_the_share_of_random_choices():
     np.testing.assert_allclose(shares, [0.6, 0.1, 0.1, 0.1, 0.1], atol=0.03)
 
 
+def test_who_practises_pursues_its_region_by_the_chances_to_reach_it():
+    chosen = settings(learner="model")
+    everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
+    state = commander.init(chosen, regions=R)
+    state = state.replace(
+        q=state.q.at[0, 1, 2].set(1.0), model=state.model.replace(reach=state.model.reach.at[0, 3, 4].set(1.0))
+    )
+    zeros = jnp.zeros(2, jnp.int32)
+    practised = jnp.array([-1, 3])
+    targets = commander.act(
+        state, everything, zeros, zeros + 1, practised=practised, epsilon=0.0, key=jax.random.key(0)
+    )
+    assert targets.tolist() == [2, 4]
+
+
 @pytest.mark.parametrize("reward", ["max", "mean"])
 def test_the_reward_of_a_period_is_the_max_or_mean_over_all_its_steps(reward):
     chosen = settings(reward=reward, period=30)
@@ -271,13 +289,14 @@ def test_the_reward_of_a_period_is_the_max_or_mean_over_all_its_steps(reward):
 
 def test_a_new_region_inherits_rows_columns_and_half_the_visits_of_its_parent():
     q, led = jax.random.uniform(jax.random.key(0), (2, R, R, R))
-    model = Model(led=led, rewards=q, visits=led, lost=q[0])
+    model = Model(led=led, rewards=q, visits=led, lost=q[0], reach=led)
     state = CommanderState(q=q, chosen=jnp.arange(1.0, R + 1), model=model)
     after = commander.on_split(state, parent=jnp.int32(1), child=jnp.int32(3))
     who = [0, 1, 2, 1, 4]
     share = np.where(np.isin(np.arange(R), [1, 3]), 0.5, 1.0)
     np.testing.assert_allclose(after.model.led, np.asarray(led)[np.ix_(who, who, who)] * share)
     np.testing.assert_array_equal(after.model.rewards, np.asarray(q)[np.ix_(who, who, who)])
+    np.testing.assert_array_equal(after.model.reach, np.asarray(led)[np.ix_(who, who, who)])
     np.testing.assert_array_equal(after.model.lost, np.asarray(q[0])[np.ix_(who, who)])
     np.testing.assert_array_equal(after.q, np.asarray(q)[np.ix_(who, who, who)])
     np.testing.assert_array_equal(after.chosen, [1, 1, 3, 1, 5])

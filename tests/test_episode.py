@@ -36,7 +36,9 @@ def test_the_recording_shows_everything_that_the_tests_below_are_about(recording
     assert (over * recording.steps.terminated).any() and (over * recording.steps.non_finite).any()
     assert len(np.unique(recording.decision.region)) > 2
     at_goal = recording.commanded.target == recording.commanded.goal_region
-    assert at_goal.any() and not at_goal.all()
+    practising = recording.commanded.practice >= 0
+    for some in (practising, at_goal & ~practising, ~at_goal & ~practising):
+        assert some.any() and not some.all()
 
 
 def test_the_clock_counts_env_steps_modulo_k_and_restarts_with_the_episode(recording):
@@ -79,10 +81,22 @@ def test_the_box_is_the_region_or_the_surroundings_of_the_goal_in_its_own_region
     for i, b in streams_and_segments(recording):
         target, goal = recording.commanded.target[i, b], recording.before.env.obs[i, b, 4:6]
         lower, upper = recording.abstraction.lower[target], recording.abstraction.upper[target]
-        if target == recording.commanded.goal_region[i, b]:
+        if target == recording.commanded.goal_region[i, b] and recording.commanded.practice[i, b] < 0:
             lower, upper = goal - margin, goal + margin
         np.testing.assert_allclose(recording.commanded.box.lower[i, b], lower, rtol=1e-6)
         np.testing.assert_allclose(recording.commanded.box.upper[i, b], upper, rtol=1e-6)
+
+
+def test_a_region_is_practised_until_it_is_reached_and_by_the_same_environments(recording):
+    redrawn = 0
+    for i, b in streams_and_segments(recording):
+        before, after = recording.before.practice[i, b], recording.commanded.practice[i, b]
+        assert (before < 0) == (after < 0) and after < recording.abstraction.count
+        reached = before == recording.commanded.region[i, b] and recording.before.clock[i, b] == 0
+        drawn_before = before < recording.abstraction.count
+        assert after == before or reached or not drawn_before
+        redrawn += reached and after != before
+    assert redrawn > 0
 
 
 def test_targets_are_active_regions(recording):
@@ -184,6 +198,7 @@ def test_dimensions_that_the_goal_leaves_open_keep_the_bounds_of_the_region(tiny
         subgoal_scale=(1.0, 1.0, 1.0),
         space=((0.0, 0.0, 0.0), (8.0, 8.0, 8.0)),
         region_cuts=((), (), (4.0,)),
+        success_radius=1.0,
     )
     obs = jnp.array([[1.0, 2.0, 9.0, 5.0, 7.0, 6.0]])  # state 1, 2, 9, 5; goal y = 7, x = 6
     point = spec.goal_point(obs)
@@ -191,6 +206,6 @@ def test_dimensions_that_the_goal_leaves_open_keep_the_bounds_of_the_region(tiny
     np.testing.assert_array_equal(spec.abstract(obs), [[1, 2, 5]])
     made = regions.create(spec.space, spec.region_cuts, max_regions=2)
     region = jnp.array([1])
-    box = episode.target_box(config.parse(tiny).agent(), spec, made, region, region, point)
+    box = episode.target_box(config.parse(tiny).agent(), spec, made, region, jnp.array([True]), point)
     np.testing.assert_array_equal(box.lower, [[5, 6, 4]])
     np.testing.assert_array_equal(box.upper, [[7, 8, 8]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import star.state
-from star import config, hierarchy, replay
+from star import config, hierarchy, refinement, replay
 from star.state import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and trainer.num_envs of the tiny hierarchy
@@ -34,6 +34,15 @@ def test_only_periods_of_exactly_k_steps_teach_commander_and_forward_model(recor
     assert 0 < count < B * len(recording.subgoal) // 2
 
 
+def test_a_period_is_lost_where_the_task_was_terminated_and_not_where_it_was_truncated(recording):
+    lost = 0
+    for i, b in segments(recording):
+        expected = (recording.steps.terminated[i, :, b] * recording.steps.alive[i, :, b]).any()
+        assert recording.decision.lost[i, b] == expected
+        lost += expected
+    assert 0 < lost < sum(ended(recording, i, b) for i, b in segments(recording))
+
+
 def test_a_finished_period_tells_where_it_began_what_it_aimed_at_and_where_it_ended(recording):
     began = {}
     for i, b in segments(recording):
@@ -46,6 +55,7 @@ def test_a_finished_period_tells_where_it_began_what_it_aimed_at_and_where_it_en
         assert decision.region[i, b] == recording.commanded.region[first, b]
         assert decision.goal_region[i, b] == recording.commanded.goal_region[first, b]
         assert decision.target[i, b] == recording.commanded.target[first, b]
+        assert decision.practised[i, b] == (recording.commanded.practice[first, b] >= 0)
         steps = np.concatenate([recording.steps.reward[first, :, b], recording.steps.reward[i, :, b]])
         expected = steps.max() if recording.published else steps.mean()
         np.testing.assert_allclose(decision.reward[i, b], expected, rtol=1e-5)
@@ -244,7 +254,11 @@ def test_a_split_reaches_every_table_indexed_by_regions(epoch):
             stable=state.graph.stable.at[0, target].set(True),
         ),
     )
-    after, metrics = jax.jit(hierarchy.refine)(epoch.config.agent(), state)
+    nowhere = jnp.zeros((1, 2))
+    goals = refinement.Goals(lower=nowhere, upper=nowhere, reached=jnp.zeros(1, bool), weight=jnp.zeros(1))
+    after, metrics = jax.jit(hierarchy.refine, static_argnums=1)(
+        epoch.config.agent(), epoch.spec, state, goals, key=jax.random.key(0)
+    )
     assert int(metrics["splits"]) == 1
     assert int(after.abstraction.count) == count + 1
     expected = np.array(q)
@@ -269,7 +283,7 @@ def test_the_published_learners_run_a_whole_epoch(breaking_env, tiny):
     td3 = {"hidden": [8], "batch_size": 8, "buffer_size": 64, "min_transitions": 8, "updates_per_rollout": 2}
     values = {
         **tiny,
-        "commander": {"period": K, "sweeps": 0, "reward": "max", "successors": "known"},
+        "commander": {"period": K, "learner": "q", "practice": 0, "reward": "max", "successors": "known"},
         "tutor": {"period": L, "unroll": 2, "learner": "td3", "off_policy_correction": True, "td3": td3},
         "controller": {"learner": "td3", "td3": td3},
     }
@@ -282,3 +296,23 @@ def test_the_published_learners_run_a_whole_epoch(breaking_env, tiny):
         assert np.isfinite(value), name
     for leaf in jax.tree.leaves((end.tutor.params, end.controller.params, end.commander)):
         assert np.isfinite(leaf).all()
+
+
+LEVELS = {
+    "hiro": {"commander.enabled": False, "commander.period": 30},
+    "gara": {"tutor.enabled": False},
+    "flat": {"commander.enabled": False, "commander.period": 30, "tutor.enabled": False},
+}
+
+
+@pytest.mark.parametrize("name", LEVELS)
+def test_levels_can_be_left_out(breaking_env, tiny, name):
+    values = config.parse(tiny, LEVELS[name]).model_dump(mode="json")
+    agent = Epoch(breaking_env, values)
+    start = agent.init(jax.random.key(0))
+    end, metrics = agent.one(agent.config.agent(), start)
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), start.controller.params, end.controller.params)
+    assert any(jax.tree.leaves(moved))
+    assert (end.tutor is None) == ("tutor/kl" not in metrics) == (name != "hiro")
+    assert ("abstraction/regions" in metrics) == (name == "gara")
+    assert bool(end.commander.chosen.any()) == (name == "gara")

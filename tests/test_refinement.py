@@ -7,8 +7,9 @@ import pytest
 
 from star import abstraction as regions
 from star import config, forward_model, refinement, replay
+from star.forward_model import Outcome
 from star.reachability import MISSES, REACHES, UNKNOWN, Leaves
-from star.refinement import Graph, Split
+from star.refinement import Goals, Graph, Split
 
 R = 6
 SPACE = ((-4.0, -4.0), (20.0, 20.0))
@@ -66,9 +67,19 @@ def moving():
     return make
 
 
+NO_GOALS = Goals(
+    lower=jnp.zeros((1, 2)), upper=jnp.zeros((1, 2)), reached=jnp.zeros(1, bool), weight=jnp.zeros(1)
+)
+
+
 @pytest.fixture(scope="module")
 def refine():
-    return jax.jit(refinement.refine)
+    jitted = jax.jit(refinement.refine)
+
+    def call(chosen, abstraction, graph, model, goals=NO_GOALS):
+        return jitted(chosen, abstraction, graph, model, goals, radius=3.0, key=jax.random.key(0))
+
+    return call
 
 
 def test_observe_counts_and_compares_errors_pair_by_pair():
@@ -126,10 +137,11 @@ def test_the_gate(name):
     assert int(waiting.sum()) == passes
 
 
-def test_the_gate_keeps_out_a_region_as_its_own_target_and_inactive_regions():
+@pytest.mark.parametrize("within", [True, False])
+def test_the_gate_keeps_out_inactive_regions_and_if_told_so_a_region_as_its_own_target(within):
     graph = knowing((1, 1), (0, 4), (4, 0), (2, 3))
-    waiting = np.asarray(refinement.due(CONFIG, graph, jnp.arange(R) < 4))
-    assert np.argwhere(waiting).tolist() == [[2, 3]]
+    waiting = np.asarray(refinement.due(settings(**{"refinement.within": within}), graph, jnp.arange(R) < 4))
+    assert np.argwhere(waiting).tolist() == [[1, 1], [2, 3]][not within :]
 
 
 def test_misses_are_forgotten_after_their_lifetime_and_edges_are_not():
@@ -197,11 +209,11 @@ def test_after_a_split_starts_inherit_verdicts_and_targets_begin_anew():
     for i in range(R):
         for j in range(R):
             changed = i in (1, 4) or j in (1, 4)
-            old = graph.verdict[1 if i == 4 else i, j]
-            assert int(after.verdict[i, j]) == (UNKNOWN if j in (1, 4) else int(old))
+            old = (1 if i == 4 else i, 1 if j == 4 else j)
+            assert int(after.verdict[i, j]) == (UNKNOWN if j in (1, 4) else int(graph.verdict[old]))
             assert float(after.transitions[i, j]) == (0 if changed else float(graph.transitions[i, j]))
-            assert float(after.error[i, j]) == (np.inf if changed else float(graph.error[i, j]))
-            assert bool(after.stable[i, j]) == (not changed and bool(graph.stable[i, j]))
+            assert float(after.error[i, j]) == float(graph.error[old])
+            assert bool(after.stable[i, j]) == bool(graph.stable[old])
     unchanged = refinement.on_split(graph, Split(done=jnp.array(False), parent=jnp.int32(1), child=jnp.int32(4)))
     jax.tree.map(np.testing.assert_array_equal, graph, unchanged)
 
@@ -281,10 +293,54 @@ def test_no_region_is_cut_narrower_than_min_width(refine, moving):
         assert int(abstraction.count) == count
 
 
-def test_an_examined_pair_may_make_several_cuts(moving):
+def test_an_examined_pair_may_make_several_cuts(refine, moving):
     # +6 along both axes: only the upper right quarter of region 0 reaches region 3, which takes two cuts to part.
     chosen = settings(**{"refinement.cuts_per_pair": 2})
-    abstraction, _, splits, _ = jax.jit(refinement.refine)(chosen, grid(), knowing((0, 3)), moving((6, 6)))
+    abstraction, _, splits, _ = refine(chosen, grid(), knowing((0, 3)), moving((6, 6)))
     assert splits.done.tolist() == [True, True]
     corners = np.concatenate([abstraction.lower, abstraction.upper], axis=1)
     assert [2, 2, 8, 8] in corners.tolist()
+
+
+DEEP = settings(**{"refinement.depth": 5})  # leaves of 1.5 by 3
+
+
+def goal_boxes(*centres, reached=()):
+    """Goals with boxes of +-1; those whose numbers are in `reached` were reached."""
+    centre = jnp.array(centres, jnp.float32)
+    mask = jnp.isin(jnp.arange(len(centres)), jnp.array(reached, int))
+    return Goals(lower=centre - 1, upper=centre + 1, reached=mask, weight=jnp.ones(len(centres)))
+
+
+def test_a_region_that_reaches_a_goal_inside_it_only_from_a_part_is_cut(refine, moving):
+    # +6 along x carries (-1.9, ...) to (4.1, ...): the square around (6, 2) inside the circle of 3 is +-2.12.
+    goals = goal_boxes((6.0, 2.0))
+    abstraction, graph, _, metrics = refine(DEEP, grid(), knowing((0, 0)), moving((6, 0)), goals)
+    assert (int(metrics["examined"]), int(metrics["mixed"]), int(metrics["splits"])) == (1, 1, 1)
+    assert int(abstraction.count) == 5
+    assert not (graph.verdict != UNKNOWN).any()
+
+
+def test_no_goal_inside_no_verdict_and_no_cut(refine, moving):
+    goals = goal_boxes((14.0, 2.0))  # in region 2
+    abstraction, graph, _, metrics = refine(CONFIG, grid(), knowing((0, 0)), moving((6, 0)), goals)
+    assert int(abstraction.count) == 4 and int(metrics["mixed"]) == 0
+    assert not (graph.verdict != UNKNOWN).any()
+    assert float(graph.transitions[0, 0]) < 100  # others get their turn
+
+
+def test_a_goal_that_was_reached_is_preferred(refine, moving):
+    # Nothing reaches (-3, 2) when all moves go to the right by 6; the outcome shows which goal was drawn.
+    lost, met = (-3.0, 2.0), (6.0, 2.0)
+    for reached, count in (((0,), 4), ((1,), 5)):
+        goals = goal_boxes(lost, met, reached=reached)
+        assert int(refine(DEEP, grid(), knowing((0, 0)), moving((6, 0)), goals)[0].count) == count
+
+
+def test_goals_come_from_decisions_at_the_goal_and_count_as_reached_within_the_circle_of_success():
+    box = jnp.array([[5.0, 5.0]] * 4)
+    end = jnp.array([[5.0, 7.0], [5.0, 7.2], [6.9, 3.1], [5.0, 5.0]])
+    outcome = Outcome(start=box, lower=box - 1, upper=box + 1, end=end, weight=jnp.array([1.0, 1.0, 1.0, 0.0]))
+    goals = Goals.of(outcome, jnp.array([True, True, False, True]), radius=3.0)  # 3 / sqrt(2) = 2.12
+    assert goals.reached.tolist() == [True, False, True, True]
+    assert goals.weight.tolist() == [1, 1, 0, 0]
