@@ -56,7 +56,7 @@ class Model(struct.PyTreeNode):
 
 
 class CommanderState(struct.PyTreeNode):
-    """Q over (region, goal region, target region), how often each target was chosen of late, and the `model`, if any."""
+    """Q over (region, goal region, target region), how often each target was chosen of late, and any `model`."""
 
     q: Float[Array, "R R R"]
     chosen: Float[Array, "R"]
@@ -231,7 +231,7 @@ def _q_learning(config: CommanderConfig, state: CommanderState, allowed: Success
 def _td_error(
     config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision
 ) -> Float[Array, "N"]:
-    """r + gamma max Q' - Q; time limits are not seen here, so every period bootstraps."""
+    """R + gamma max Q' - Q; time limits are not seen here, so every period bootstraps."""
     future = _best(state.q, allowed.greedy)[batch.next_region, batch.goal_region]
     return batch.reward + config.discount * future - state.q[batch.region, batch.goal_region, batch.target]
 

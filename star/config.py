@@ -140,7 +140,8 @@ class CommanderConfig(Section):
         "all disregards reachability in random choices and plans too",
     )
     reward: Literal["success", "mean", "max"] = Field(
-        "success", description="of a decision: mean success and nearness of its k env steps, or mean or maximum of r_ext"
+        "success",
+        description="of a decision: mean success and nearness of its k env steps, or mean or maximum of r_ext",
     )
     nearness: float = Field(0.2, ge=0, description="weight in reward success of 1 - distance / diameter of the space")
     sweeps: Positive = Field(10, description="sweeps of value iteration of learner model after every k env steps")
@@ -157,6 +158,9 @@ class LevelConfig(Section):
     learner: Literal["ppo", "td3"] = Field("ppo", description="learning algorithm")
     reward: Literal["distance", "progress"] = Field("progress", description="minus the distance, or its decrease")
     reward_scale: float = Field(1.0, gt=0, description="factor on the reward")
+    termination_penalty: float = Field(
+        0.0, ge=0, description="taken off the reward where the task is terminated, as by a flip"
+    )
     ppo: PPOConfig = Field(PPOConfig(), description="settings used when learner is ppo")
     td3: TD3Config = Field(TD3Config(), description="settings used when learner is td3")
 
@@ -317,9 +321,7 @@ class AgentConfig(Section):
     refinement: RefinementConfig
 
 
-def load(
-    path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers: Sequence[str | Path] = ()
-) -> Config:
+def load(path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers: Sequence[str | Path] = ()) -> Config:
     """Read a YAML file, lay others over it, apply dotted overrides such as `{"tutor.period": 5}` and validate.
 
     Raises:
@@ -337,9 +339,10 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)
-        whole = key in ("options", "training")
-        both = isinstance(old, Mapping) and isinstance(value, Mapping) and not whole
-        merged[key] = _merged(old, value) if both else value
+        if isinstance(old, Mapping) and isinstance(value, Mapping) and key not in ("options", "training"):
+            merged[key] = _merged(old, value)
+        else:
+            merged[key] = value
     return merged
 
 

@@ -28,7 +28,6 @@ from star.config import AgentConfig
 from star.state import Spec, TrainState
 from star.tutor import Box
 
-
 _ANY = 1_000_000  # a region to practise that is still to be drawn; larger than any index
 
 

@@ -72,7 +72,7 @@ def _block(
     )
     state, streams = carry
     metrics = jax.tree.map(jnp.mean, metrics)
-    if config.tutor.enabled:
+    if decisions is not None:
         relabel = _relabel(config, spec, state) if config.tutor.off_policy_correction else None
         learnt, more = learner.update(
             config.tutor,
@@ -106,11 +106,9 @@ def _segment(
     controller_state, controller_metrics = learner.update(
         config.controller, state.controller, experience, relabel=in_hindsight, key=update_key
     )
-    metrics = _prefix(
-        "controller", controller_metrics | {"reward": _weighted(experience.reward, experience.weight)}
-    )
+    metrics = _prefix("controller", controller_metrics | {"reward": _weighted(experience.reward, experience.weight)})
     streams = episode.advance(config, streams)
-    decision, outcome = _finished_period(config, spec, state, streams, steps)
+    decision, outcome = finished_period(config, spec, state, streams, steps)
     if config.commander.enabled:
         state = state.replace(commander=_command_better(config, spec, state, allowed, decision, number))
     transition = None
@@ -208,9 +206,8 @@ def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transi
     return Transition(
         obs=observe(spec.state(steps.obs), steps.subgoal),
         action=steps.action,
-        reward=controller.reward(
-            config.controller, steps.subgoal, steps.next_subgoal, size=len(spec.abstract_indices)
-        ),
+        reward=controller.reward(config.controller, steps.subgoal, steps.next_subgoal, size=len(spec.abstract_indices))
+        - config.controller.termination_penalty * steps.terminated,
         next_obs=observe(spec.state(steps.next_obs), steps.next_subgoal),
         terminated=steps.terminated,
         cut=jnp.maximum(last, steps.ended),
@@ -260,7 +257,7 @@ def _tutor_transition(
     return Transition(
         obs=observe(spec.state(began), spec.abstract(began), streams.box),
         action=action,
-        reward=tutor.reward(config.tutor, distances, steps.alive),
+        reward=tutor.reward(config.tutor, distances, steps.alive) - config.tutor.termination_penalty * terminated,
         next_obs=observe(spec.state(end), spec.abstract(end), streams.box),
         terminated=terminated,
         cut=jnp.maximum(streams.clock == 0, ended) if config.commander.enabled else ended,
@@ -269,7 +266,7 @@ def _tutor_transition(
     )
 
 
-def _finished_period(
+def finished_period(
     config: AgentConfig, spec: Spec, state: TrainState, streams: Streams, steps: Steps
 ) -> tuple[Decision, Outcome]:
     """The Commander's decisions that came to their end with this segment; weight 0 elsewhere."""
@@ -312,12 +309,12 @@ def _relabel(config: AgentConfig, spec: Spec, state: TrainState) -> Any:
 
 def _penalty(config: AgentConfig, spec: Spec, state: TrainState) -> Penalty:
     """The price of subgoals that are not adjacent to where they are set."""
+    known = state.adjacency
+    assert known is not None
 
     def price(batch: Transition, action: Array) -> Array:
         start = batch.extras.achieved[..., 0, :] if config.tutor.off_policy_correction else batch.extras
-        return adjacency.penalty(
-            config.tutor.adjacency, state.adjacency, start, tutor.subgoal(action, spec.scale)
-        )
+        return adjacency.penalty(config.tutor.adjacency, known, start, tutor.subgoal(action, spec.scale))
 
     return price
 

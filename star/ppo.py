@@ -196,7 +196,7 @@ def _loss(
     log_ratio = _log_prob(mean, std, batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
-    price = penalty(batch.transition, mean) if penalty is not None else 0.0
+    price = 0.0 if penalty is None or batch.transition is None else penalty(batch.transition, mean)
     actor_loss = jnp.sum(share * (price - jnp.minimum(ratio * advantage, clipped * advantage)))
     critic_loss = 0.5 * jnp.sum(share * jnp.square(_value(config, params, batch.obs) - batch.target))
     entropy = jnp.sum(jnp.log(std)) + 0.5 * std.shape[0] * jnp.log(2 * jnp.pi * jnp.e)

@@ -193,7 +193,8 @@ def refine(
 ) -> tuple[Abstraction, Graph, Split, Metrics]:
     """Examine the due pairs of one epoch, at most `pairs_per_epoch`, and cut where a verdict is mixed.
 
-    `radius` is that of success around goals. Returns the splits in the order made, stacked [pairs_per_epoch * cuts_per_pair], for tables indexed by region.
+    `radius` is that of success around goals. Returns the splits in the order made, stacked
+    [pairs_per_epoch * cuts_per_pair], for tables indexed by region.
     """
     graph = forget(config, graph)
     starts, seen = forward_model.visited(model)
@@ -257,7 +258,7 @@ def on_split(graph: Graph, split: Split) -> Graph:
     return regions.where(split.done, parts, graph)
 
 
-def _widening(half: Float[Array, "*n d"], radius: float) -> Float[Array, "*n d"]:
+def _widening(half: Float[Array, "*n d"], radius: float | Array) -> Float[Array, "*n d"]:
     """What a box of half-widths `half` lacks to the cube inside a ball of that radius."""
     return jnp.maximum(radius / half.shape[-1] ** 0.5 - half, 0.0)
 

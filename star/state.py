@@ -126,9 +126,7 @@ def first_cuts(config: AgentConfig | Config, spec: Spec) -> Sequence[Sequence[fl
     if config.abstraction.grid is None:
         return spec.region_cuts if config.abstraction.cuts is None else config.abstraction.cuts
     parts = (*config.abstraction.grid, *[1] * (len(spec.abstract_indices) - len(config.abstraction.grid)))
-    return [
-        np.linspace(low, high, n + 1)[1:-1].tolist() for n, low, high in zip(parts, *spec.space, strict=False)
-    ]
+    return [np.linspace(low, high, n + 1)[1:-1].tolist() for n, low, high in zip(parts, *spec.space, strict=False)]
 
 
 def check(config: Config, spec: Spec) -> None:
@@ -145,8 +143,11 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(
             f"tutor.adjacency.cell: {config.tutor.adjacency.cell} makes {cells} cells, more than {adjacency.MAX_CELLS}"
         )
-    if len(config.abstraction.grid or ()) > len(spec.abstract_indices):
-        raise ValueError(f"abstraction.grid: {list(config.abstraction.grid)} has more than the {len(spec.abstract_indices)} abstract dimensions")
+    grid, dimensions = config.abstraction.grid or (), len(spec.abstract_indices)
+    if len(grid) > dimensions:
+        raise ValueError(
+            f"abstraction.grid: {list(grid)} has more parts than there are abstract dimensions, {dimensions}"
+        )
     for name, section, decisions in (
         ("tutor", config.tutor, config.tutor.unroll),
         ("controller", config.controller, config.tutor.period),

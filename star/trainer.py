@@ -287,12 +287,12 @@ def _resolve(config: Config, engine: str, spec: Spec) -> Config:
     return parse(values)
 
 
-def make_env(config: Config, goals: str) -> Any:
-    """The task of `config`: on its test goals with "test", as for training with "train"."""
+def make_env(config: Config, goals: str, **others: Any) -> Any:
+    """The task of `config`: on its test goals with "test", as for training with "train"; `others` are options too."""
     if goals == "train":
-        options = {"goals": goals} | config.env.options | config.env.training
+        options = {"goals": goals} | config.env.options | config.env.training | others
     else:
-        options = config.env.options | {"goals": goals}
+        options = config.env.options | {"goals": goals} | others
     try:
         return envs.make(config.env.name, engine=config.env.engine, **options)
     except envs.EnvError as error:

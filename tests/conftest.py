@@ -114,7 +114,7 @@ def record(agent, spec, env, state, key):
             agent, spec, env, state, commanded, subgoal, deterministic=False, key=rollout_key
         )
         advanced = episode.advance(agent, rolled)
-        decision, outcome = hierarchy._finished_period(agent, spec, state, advanced, steps)
+        decision, outcome = hierarchy.finished_period(agent, spec, state, advanced, steps)
         saved = {
             "before": before,
             "commanded": commanded,

@@ -43,7 +43,11 @@ def slow_update(q, allowed, batch, *, alpha, discount):
     for i, g, j in {*zip(batch.region.tolist(), batch.goal_region.tolist(), batch.target.tolist(), strict=True)}:
         errors = []
         for n in range(N):
-            if batch.weight[n] and not batch.practised[n] and (batch.region[n], batch.goal_region[n], batch.target[n]) == (i, g, j):
+            if (
+                batch.weight[n]
+                and not batch.practised[n]
+                and (batch.region[n], batch.goal_region[n], batch.target[n]) == (i, g, j)
+            ):
                 after = batch.next_region[n]
                 best = max(q[after, g, k] for k in range(R) if allowed[after, k])
                 errors.append(batch.reward[n] + discount * best - q[i, g, j])

@@ -74,7 +74,7 @@ def test_a_misspelt_key_names_the_nearest_valid_one(write, text, wrong, nearest)
 
 def test_a_key_like_no_other_lists_those_of_its_section(write):
     message = refusal(write("abstraction: {zzz: 1}"))
-    assert message.endswith("abstraction.zzz: unknown key (allowed: max_regions, cuts, min_width)")
+    assert message.endswith("abstraction.zzz: unknown key (allowed: max_regions, cuts, grid, min_width)")
 
 
 @pytest.mark.parametrize(
@@ -107,7 +107,7 @@ def test_a_wrong_type_names_key_value_and_what_is_allowed(write, text, key, valu
         ("abstraction: {max_regions: 5000}", "abstraction.max_regions: 5000", "less than or equal to 1024"),
         ("refinement: {depth: 9}", "refinement.depth: 9", "less than or equal to 8"),
         ("tutor: {learner: sac}", "tutor.learner: 'sac'", "'ppo' or 'td3'"),
-        ("commander: {successors: all}", "commander.successors: 'all'", "'any', 'possible' or 'known'"),
+        ("commander: {successors: some}", "commander.successors: 'some'", "'all', 'any', 'possible' or 'known'"),
     ],
 )
 def test_a_value_out_of_range_names_the_range(write, text, key, allowed):
@@ -305,3 +305,28 @@ def test_several_values_of_a_float_run_under_one_vmap():
     stacked = jax.tree.map(lambda *leaves: jnp.array(leaves), *agents)
     doubled = jax.vmap(lambda agent: 2 * agent.commander.learning_rate + agent.tutor.period)(stacked)
     assert doubled.tolist() == pytest.approx([10.2, 10.4])
+
+
+def test_layers_replace_only_what_they_name_and_task_options_as_a_whole(write, tmp_path):
+    below = write("env: {name: ant_maze, options: {cell: 4}}\ntutor: {unroll: 2, ppo: {clip: 0.1, passes: 2}}")
+    layer = tmp_path / "layer.yaml"
+    layer.write_text("tutor: {ppo: {clip: 0.3}}\nenv: {options: {goals: test}}")
+    got = load(below, {"tutor.ppo.passes": 7}, layers=[layer])
+    assert (got.tutor.unroll, got.tutor.ppo.clip, got.tutor.ppo.passes) == (2, 0.3, 7)
+    assert got.env.name == "ant_maze" and got.env.options == {"goals": "test"}
+
+
+def test_an_error_names_all_files_it_may_come_from(write, tmp_path):
+    layer = tmp_path / "layer.yaml"
+    layer.write_text("tutor: {unrol: 3}")
+    with pytest.raises(ConfigError, match=r"maze.yaml with .*layer.yaml: tutor.unrol: unknown key"):
+        load(write("tutor: {unroll: 2}"), layers=[layer])
+
+
+@pytest.mark.parametrize("folder", ["agents", "ablations"])
+def test_every_shipped_layer_fits_every_shipped_config(pytestconfig, folder):
+    layers = sorted((pytestconfig.rootpath / "configs" / folder).glob("*.yaml"))
+    assert len(layers) >= 5
+    for layer in layers:
+        for file in (pytestconfig.rootpath / "configs").glob("*.yaml"):
+            assert load(file, layers=[layer]) != load(file), (file, layer)

@@ -7,6 +7,7 @@ import pytest
 
 import star.state
 from star import config, hierarchy, refinement, replay
+from star.replay import Transition
 from star.state import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and trainer.num_envs of the tiny hierarchy
@@ -302,6 +303,7 @@ LEVELS = {
     "hiro": {"commander.enabled": False, "commander.period": 30},
     "gara": {"tutor.enabled": False},
     "flat": {"commander.enabled": False, "commander.period": 30, "tutor.enabled": False},
+    "hrac": {"commander.enabled": False, "tutor.adjacency.enabled": True, "tutor.adjacency.hidden": [8]},
 }
 
 
@@ -313,6 +315,54 @@ def test_levels_can_be_left_out(breaking_env, tiny, name):
     end, metrics = agent.one(agent.config.agent(), start)
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), start.controller.params, end.controller.params)
     assert any(jax.tree.leaves(moved))
-    assert (end.tutor is None) == ("tutor/kl" not in metrics) == (name != "hiro")
+    assert (end.tutor is None) == ("tutor/kl" not in metrics) == (name in ("gara", "flat"))
     assert ("abstraction/regions" in metrics) == (name == "gara")
     assert bool(end.commander.chosen.any()) == (name == "gara")
+    assert (end.adjacency is not None and bool(end.adjacency.adjacent.any())) == (name == "hrac")
+
+
+@pytest.mark.parametrize("tutored", [True, False])
+def test_hindsight_makes_what_was_reached_the_subgoal_of_half_of_the_batch(breaking_env, tiny, tutored):
+    learner = {"controller.learner": "td3", "controller.hindsight": True, "tutor.enabled": tutored}
+    agent, spec = config.parse(tiny, learner).agent(), Spec.of(breaking_env.env)
+    rng = np.random.default_rng(0)
+    n, size = 400, 2 if tutored else 4
+    reached = rng.normal(size=(n, 2, 2)).astype(np.float32)
+    batch = Transition(
+        obs=jnp.full((n, 2 + size), 7.0),
+        action=jnp.zeros((n, 2)),
+        reward=jnp.full(n, 7.0),
+        next_obs=jnp.full((n, 2 + size), 7.0),
+        terminated=jnp.zeros(n),
+        cut=jnp.zeros(n),
+        weight=jnp.ones(n),
+        extras=jnp.asarray(reached),
+    )
+    got = hierarchy._in_hindsight(agent, spec, batch, jax.random.key(0))
+    changed = np.asarray(got.reward) != 7.0
+    assert 0.4 < changed.mean() < 0.6
+    np.testing.assert_array_equal(got.obs[:, :2], batch.obs[:, :2])
+    for seen, place in ((got.obs, 0), (got.next_obs, 1)):
+        np.testing.assert_array_equal(np.asarray(seen)[~changed], 7.0)
+        np.testing.assert_array_equal(np.asarray(seen)[changed, 2:], np.tile(reached[changed, place], size // 2))
+    distance = np.linalg.norm(reached, axis=-1)
+    np.testing.assert_allclose(np.asarray(got.reward)[changed], (distance[:, 0] - distance[:, 1])[changed], atol=1e-5)
+
+
+def test_a_termination_costs_its_penalty(breaking_env, tiny, recording):
+    prices = {"controller.termination_penalty": 3.0, "tutor.termination_penalty": 5.0}
+    dear, free = (config.parse(recording.config.model_dump(), values).agent() for values in (prices, {}))
+    steps = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.steps)
+    paid = hierarchy._controller_rollout(free, recording.spec, steps).reward
+    less = hierarchy._controller_rollout(dear, recording.spec, steps).reward
+    np.testing.assert_allclose(paid - less, 3.0 * steps.terminated, atol=1e-5)
+    assert steps.terminated.any()
+
+
+def test_what_is_reached_later_in_the_segment_is_seen_from_every_step(recording):
+    steps = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.steps)
+    later = np.asarray(hierarchy._later(recording.spec, steps))
+    end = recording.steps.next_obs[0, -1, :, :2]
+    for t in range(L):
+        np.testing.assert_allclose(later[t, :, 0], end - recording.steps.obs[0, t, :, :2], atol=1e-5)
+        np.testing.assert_allclose(later[t, :, 1], end - recording.steps.next_obs[0, t, :, :2], atol=1e-5)

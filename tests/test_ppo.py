@@ -140,3 +140,14 @@ def test_it_learns_a_bandit_with_two_contexts():
     action, metrics = learn(jax.random.key(0))
     np.testing.assert_allclose(action[:, 0], [0.5, -0.5], atol=0.15)
     assert metrics["std"][-1] < metrics["std"][0]
+
+
+def test_a_price_on_the_mean_action_pulls_it_away(start):
+    rollout = jax.tree.map(jnp.asarray, random_rollout())
+    away = lambda batch, action: 100.0 * jnp.square(action - 1.0).sum(axis=-1)  # noqa: E731
+    update = jax.jit(lambda s, key: ppo.update(settings(target_kl=1.0), s, rollout, penalty=away, key=key)[0])
+    state = start
+    for i in range(20):
+        state = update(state, jax.random.key(i))
+    mean = lambda s: ppo.act(settings(), s, rollout.obs, deterministic=True, key=jax.random.key(0)).mean()  # noqa: E731
+    assert float(mean(state)) > float(mean(start)) + 0.1

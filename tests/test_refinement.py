@@ -67,9 +67,7 @@ def moving():
     return make
 
 
-NO_GOALS = Goals(
-    lower=jnp.zeros((1, 2)), upper=jnp.zeros((1, 2)), reached=jnp.zeros(1, bool), weight=jnp.zeros(1)
-)
+NO_GOALS = Goals(lower=jnp.zeros((1, 2)), upper=jnp.zeros((1, 2)), reached=jnp.zeros(1, bool), weight=jnp.zeros(1))
 
 
 @pytest.fixture(scope="module")
@@ -344,3 +342,16 @@ def test_goals_come_from_decisions_at_the_goal_and_count_as_reached_within_the_c
     goals = Goals.of(outcome, jnp.array([True, True, False, True]), radius=3.0)  # 3 / sqrt(2) = 2.12
     assert goals.reached.tolist() == [True, False, True, True]
     assert goals.weight.tolist() == [1, 1, 0, 0]
+
+
+def test_random_cuts_come_at_the_same_time_but_anywhere(refine, moving):
+    chosen = settings(**{"refinement.cuts": "random", "refinement.depth": 5})
+    jitted = jax.jit(refinement.refine)
+    positions = set()
+    for seed in range(8):
+        abstraction, _, splits, metrics = jitted(
+            chosen, grid(), knowing((0, 2)), moving((6, 0)), NO_GOALS, radius=3.0, key=jax.random.key(seed)
+        )
+        assert int(metrics["mixed"]) == int(metrics["splits"]) == 1 and int(splits.parent[0]) == 0
+        positions.add(tuple(np.asarray(abstraction.lower[4]).tolist()))
+    assert len(positions) > 3

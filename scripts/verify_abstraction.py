@@ -1,0 +1,135 @@
+"""Is the abstraction of a trained agent true? Roll out what reachability analysis has judged.
+
+    python scripts/verify_abstraction.py RUN [--checkpoint last] [--episodes 512] [--start free] [--out FILE.json]
+
+Agents start anywhere in the free cells and are commanded random regions, so that every decision of k env steps is a
+rollout from a random start of a random pair (region, target). For each seed:
+
+    reaches     of the rollouts of pairs judged REACHES, the share that ended in the target; `pairs` is their number
+    misses      of the rollouts of pairs judged MISSES, the share that did not
+    base        of all rollouts between different regions, the share that ended in the target
+    error       root mean square error of the forward model on these rollouts, in units of the state, and `still`, that
+                of the guess that the agent stays where it is
+    walls       share of the faces between regions that lie within 1 m of the plane of a wall, and `chance`, the share
+                of all positions in the space that do
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs.vector import VectorEnv
+from star import episode, forward_model, hierarchy, trainer
+from star.commander import Successors
+from star.config import AgentConfig, load
+from star.reachability import MISSES, REACHES
+from star.state import Spec, TrainState
+
+NEAR_WALL = 1.0  # m
+
+
+def rollouts(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, key: jax.Array) -> Any:
+    """(decisions, outcomes) of all periods of one episode under random commands; leading axes [segments, B]."""
+    pairs = state.abstraction.active[:, None] & state.abstraction.active[None, :]
+
+    def segment(streams: episode.Streams, key: jax.Array) -> tuple[episode.Streams, Any]:
+        command_key, tutor_key, rollout_key, reset_key = jax.random.split(key, 4)
+        everything = Successors(greedy=pairs, explore=pairs)
+        streams = episode.command(config, spec, state, everything, streams, epsilon=1.0, key=command_key)
+        subgoal, _ = episode.choose_subgoal(config, spec, state, streams, deterministic=False, key=tutor_key)
+        streams, steps = episode.rollout(
+            config, spec, env, state, streams, subgoal, deterministic=False, key=rollout_key
+        )
+        streams = episode.advance(config, streams)
+        finished = hierarchy.finished_period(config, spec, state, streams, steps)
+        return episode.restart_ended(env, streams, steps, key=reset_key), finished
+
+    start_key, scan_key = jax.random.split(key)
+    streams = episode.start(spec, env, practice=1.0, key=start_key)  # so that targets are regions, never goals
+    keys = jax.random.split(scan_key, spec.episode_length // config.tutor.period)
+    return jax.lax.scan(segment, streams, keys)[1]
+
+
+def judge(config: AgentConfig, spec: Spec, state: TrainState, finished: Any, walls: np.ndarray) -> dict[str, Any]:
+    """The figures of one seed."""
+    decision, outcome = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), finished)
+    counted = (decision.weight > 0) & (decision.region != decision.target)
+    verdict = np.asarray(state.graph.verdict)[decision.region, decision.target]
+    arrived = decision.next_region == decision.target
+
+    def share(mask: np.ndarray, right: np.ndarray) -> dict[str, Any]:
+        n = int((mask & counted).sum())
+        pairs = {*zip(decision.region[mask & counted], decision.target[mask & counted], strict=True)}
+        return {"share": float(right[mask & counted].mean()) if n else None, "rollouts": n, "pairs": len(pairs)}
+
+    error = np.asarray(forward_model.errors(config.forward_model, state.forward_model, outcome))
+    still = np.square(outcome.start - outcome.end).sum(-1)
+    return {
+        "regions": int(state.abstraction.count),
+        "reaches": share(verdict == REACHES, arrived),
+        "misses": share(verdict == MISSES, ~arrived),
+        "base": share(np.ones_like(arrived), arrived),
+        "error": {"model": _root_mean(error, counted), "still": _root_mean(still, counted)},
+        "walls": near_walls(state, walls, np.asarray(spec.space)),
+    }
+
+
+def near_walls(state: TrainState, walls: np.ndarray, space: np.ndarray) -> dict[str, Any]:
+    """Faces of regions inside the space, in x and y, and how many of them lie near the plane of a wall."""
+    count = int(state.abstraction.count)
+    faces, hits, chances = 0, 0, []
+    for axis in (0, 1):
+        planes = np.unique(walls[:, [axis, axis + 2]])
+        planes = planes[(planes > space[0, axis]) & (planes < space[1, axis])]
+        upper = np.asarray(state.abstraction.upper[:count, axis])
+        inner = upper[upper < space[1, axis] - 1e-4]
+        distance = lambda x, planes=planes: np.abs(x[:, None] - planes).min(axis=1, initial=np.inf)  # noqa: E731
+        faces, hits = faces + len(inner), hits + int((distance(inner) <= NEAR_WALL).sum())
+        chances.append(float((distance(np.linspace(space[0, axis], space[1, axis], 1001)) <= NEAR_WALL).mean()))
+    return {"share": hits / faces if faces else None, "faces": faces, "chance": float(np.mean(chances))}
+
+
+def _root_mean(squares: np.ndarray, mask: np.ndarray) -> float | None:
+    return float(np.sqrt(squares[mask].mean())) if mask.any() else None
+
+
+def main() -> None:
+    """Print one line a seed and write all figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--checkpoint", default="last")
+    parser.add_argument("--episodes", type=int, default=512)
+    parser.add_argument("--start", default="free", choices=("task", "free"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+
+    config = load(options.run / "config.yaml", {"env.engine": "auto"})
+    program = trainer.build(config)
+    step, states = trainer.load_checkpoint(program, options.run, options.checkpoint)
+    agent, spec = program.config.agent(), program.spec
+    task = trainer.make_env(program.config, "train", start=options.start)
+    env = VectorEnv(task, options.episodes, auto_reset=False)
+    roll = jax.jit(partial(rollouts, agent, spec, env))
+    keys = trainer.evaluation_keys(program, options.seed, stream=trainer.AFTERWARDS)
+    rows = []
+    for i, seed in enumerate(program.seeds):
+        state = jax.tree.map(lambda x, i=i: x[i], states)
+        row = {"seed": seed} | judge(agent, spec, state, roll(state, keys[i]), program.walls)
+        rows.append(row)
+        print(json.dumps(row), flush=True)
+    report = {"run": str(options.run), "env": config.env.name, "env_steps": step, "start": options.start, "seeds": rows}
+    if options.out is not None:
+        options.out.parent.mkdir(parents=True, exist_ok=True)
+        options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
