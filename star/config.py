@@ -131,6 +131,7 @@ class CommanderConfig(Section):
     epsilon_start: float = Field(0.5, ge=0, le=1, description="share of random targets at the start")
     epsilon_end: float = Field(0.1, ge=0, le=1, description="share of random targets after epsilon_steps")
     epsilon_steps: float = Field(1e6, gt=0, description="env steps over which epsilon falls linearly")
+    hold: bool = Field(True, description="command the goal wherever it counts as reached, whatever the table says")
     practice: float = Field(
         0.25, ge=0, le=1, description="share of environments that practise reaching random regions, one after another"
     )

@@ -172,6 +172,9 @@ def command(
         target = commander.act(
             state.commander, allowed, region, goal_region, practised=practice, epsilon=epsilon, key=act_key
         )
+        if config.commander.hold:
+            there = (streams.env.metrics["success"] > 0) & (practice < 0)
+            target = jnp.where(there, goal_region, target)
     holds_goal = (target == goal_region) & (practice < 0)
     fresh = Streams(
         env=streams.env,

@@ -1,0 +1,206 @@
+"""Train and evaluate the agents of a results table, and draw their curves.
+
+    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--one-by-one] [--out results/TASK] [--section.key VALUE]
+
+TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents or configs/ablations laid
+over it; by default all agents. Settings are passed on to `star train`. For each name the seeds are trained side by side
+in one program, or with --one-by-one one after another, which is how wall-clock times to a success are meant to be
+taken. Into the folder go
+
+    NAME.json     every seed's success on `--episodes` greedy episodes on test goals, env steps and training seconds,
+                  compilation included, to success_any .9 (null: never), the command, commit, device and versions
+    curves.jsonl  all evaluations during training
+    curves.png    success_any over env steps and over wall-clock: mean over seeds and their range
+    table.md      means over seeds and interquartile means with 95 % bootstrap intervals
+
+A name whose JSON exists is not trained again. Runs are kept under `--runs`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import shlex
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
+ROOT = Path(__file__).parents[1]
+AGENTS = ("star", "hiro", "hrac", "gara", "flat", "flat_td3")
+LEVEL = 0.9  # of success_any, for the time to it
+STAR = (sys.executable, "-m", "star.cli")
+_DEVICE = "import jax; d = jax.devices()[0]; print(d.device_kind if d.platform == 'gpu' else 'CPU')"
+
+
+def layer(name: str) -> list[str]:
+    """Arguments of `star train` that turn the task's config into that of the agent `name`; SystemExit if unknown."""
+    if name == "star":
+        return []
+    for folder in ("agents", "ablations"):
+        path = Path("configs") / folder / f"{name}.yaml"
+        if (ROOT / path).is_file():
+            return ["--with", str(path)]
+    known = sorted(path.stem for folder in ("agents", "ablations") for path in (ROOT / "configs" / folder).glob("*"))
+    raise SystemExit(f"error: {name}: no such agent; known are star, {', '.join(known)}")
+
+
+def measure(task: str, name: str, options: argparse.Namespace, settings: list[str]) -> tuple[dict[str, Any], list]:
+    """Train and evaluate one agent: what goes into its JSON, and its evaluations during training."""
+    groups = [[seed] for seed in range(options.seeds)] if options.one_by_one else [list(range(options.seeds))]
+    rows: list[dict[str, Any]] = []
+    evaluated: list[dict[str, Any]] = []
+    commands = []
+    for seeds in groups:
+        run = options.runs / task / f"{name}-{seeds[0]}"
+        chosen = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), *settings]
+        train = ["train", f"configs/{task}.yaml", *layer(name), *chosen, "--run-dir", str(run)]
+        if not (run / "figures" / "summary.png").exists():
+            subprocess.run([*STAR, *train], cwd=ROOT, check=True)
+        commands.append(shlex.join(["star", *train]))
+        rows += [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+        evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--json"]
+        report = subprocess.run(evaluate, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+        evaluated += json.loads(report.splitlines()[-1])["seeds"]
+    keys = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
+    curve = [{"name": name} | {k: row[k] for k in keys if k in row} for row in rows if "eval/success_any" in row]
+    for seed in evaluated:
+        first = next((p for p in curve if p["seed"] == seed["seed"] and p["eval/success_any"] >= LEVEL), None)
+        seed |= {"env_steps_to_level": first and first["env_steps"], "seconds_to_level": first and first["wall_s"]}
+    speeds = [row["env_steps_per_s"] for row in rows]
+    return {
+        "task": task,
+        "name": name,
+        "seeds": evaluated,
+        "one_by_one": options.one_by_one,
+        "env_steps_per_seed": max(row["env_steps"] for row in rows),
+        "env_steps_per_s": float(np.median(speeds)),
+        "commands": commands,
+        **provenance(),
+    }, curve
+
+
+def provenance() -> dict[str, Any]:
+    """Commit, device and versions."""
+    git = ["git", "-C", str(ROOT)]
+    commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    changed = bool(
+        subprocess.run([*git, "status", "--porcelain", "star", "envs", "configs"], capture_output=True).stdout
+    )
+    device = subprocess.run([sys.executable, "-c", _DEVICE], capture_output=True, text=True).stdout.strip()
+    names = ("jax", "mujoco", "mujoco-mjx", "brax")
+    return {
+        "commit": commit + "+" * changed,
+        "device": device,
+        "python": platform.python_version(),
+        "versions": {name: metadata.version(name) for name in names},
+    }
+
+
+def interval(values: list[float], statistic: Any) -> tuple[float, float, float]:
+    """The statistic over seeds with its 95 % percentile bootstrap interval; a single seed is its own interval."""
+    data = np.asarray(values, float)
+    middle = float(statistic(data))
+    if len(data) < 2 or np.ptp(data) == 0:
+        return middle, middle, middle
+    found = stats.bootstrap((data,), statistic, method="percentile", vectorized=False, rng=0, n_resamples=4999)
+    return middle, float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def interquartile_mean(values: np.ndarray) -> float:
+    """Mean of the middle half."""
+    return float(stats.trim_mean(values, 0.25))
+
+
+def table(reports: list[dict[str, Any]]) -> str:
+    """A Markdown table of the agents."""
+    lines = [
+        "| agent | seeds | env steps per seed | success_any | success_final | interquartile mean of success_final "
+        f"| median env steps to success_any {LEVEL:g} | median seconds to it |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for report in reports:
+        seeds = report["seeds"]
+        cells = [report["name"], str(len(seeds)), f"{report['env_steps_per_seed'] / 1e6:.1f} M"]
+        for key, statistic in (
+            ("success_any", np.mean),
+            ("success_final", np.mean),
+            ("success_final", interquartile_mean),
+        ):
+            cells.append("{:.2f} [{:.2f}, {:.2f}]".format(*interval([seed[key] for seed in seeds], statistic)))
+        for key, form in (
+            ("env_steps_to_level", lambda x: f"{x / 1e6:.1f} M"),
+            ("seconds_to_level", "{:.0f} s".format),
+        ):
+            middle = float(np.median([np.inf if seed[key] is None else seed[key] for seed in seeds]))
+            cells.append(form(middle) if np.isfinite(middle) else "never")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def draw(curves: list[dict[str, Any]], path: Path) -> None:
+    """success_any over env steps and over wall-clock, mean and range over seeds."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    for name in dict.fromkeys(point["name"] for point in curves):
+        mine = [point for point in curves if point["name"] == name]
+        steps = sorted({point["env_steps"] for point in mine})
+        at = [[p for p in mine if p["env_steps"] == step] for step in steps]
+        low, mean, high = (
+            [f([p["eval/success_any"] for p in points]) for points in at] for f in (np.min, np.mean, np.max)
+        )
+        seconds = [np.mean([p["wall_s"] for p in points]) for points in at]
+        for axis, x in zip(axes, (np.asarray(steps) / 1e6, seconds), strict=True):
+            (line,) = axis.plot(x, mean, label=name)
+            axis.fill_between(x, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+    axes[0].set(xlabel="million env steps per seed", ylabel="success_any on test goals", ylim=(-0.02, 1.02))
+    axes[1].set(xlabel="seconds, compilation included")
+    axes[1].legend()
+    for axis in axes:
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Fill the folder of one task."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("task")
+    parser.add_argument("names", nargs="*", default=AGENTS)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--one-by-one", action="store_true")
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--runs", type=Path, default=Path("runs/reproduce"))
+    options, settings = parser.parse_known_args(arguments)
+    if not (ROOT / "configs" / f"{options.task}.yaml").is_file():
+        raise SystemExit(f"error: configs/{options.task}.yaml: no such file")
+    options.runs = options.runs.resolve()
+    for name in options.names:
+        layer(name)
+
+    out = options.out or ROOT / "results" / options.task
+    out.mkdir(parents=True, exist_ok=True)
+    record = out / "curves.jsonl"
+    for name in options.names:
+        if (out / f"{name}.json").exists():
+            continue
+        report, curve = measure(options.task, name, options, settings)
+        old = [json.loads(line) for line in record.read_text(encoding="utf-8").splitlines()] if record.exists() else []
+        kept = [point for point in old if point["name"] != name] + curve
+        record.write_text("".join(json.dumps(point) + "\n" for point in kept), encoding="utf-8")
+        (out / f"{name}.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    reports = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(out.glob("*.json"))]
+    reports.sort(key=lambda report: (report["name"] != "star", report["name"]))
+    (out / "table.md").write_text(table(reports), encoding="utf-8")
+    draw([json.loads(line) for line in record.read_text(encoding="utf-8").splitlines()], out / "curves.png")
+    print(table(reports))
+
+
+if __name__ == "__main__":
+    main()
