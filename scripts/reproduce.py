@@ -1,9 +1,9 @@
 """Train and evaluate the agents of a results table, and draw their curves.
 
-    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--one-by-one] [--out results/TASK] [--section.key VALUE]
+    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--one-by-one] [--out results/TASK] [-- SETTINGS]
 
 TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents or configs/ablations laid
-over it; by default all agents. Settings are passed on to `star train`. For each name the seeds are trained side by side
+over it; by default all agents. SETTINGS are passed on to `star train`. For each name the seeds are trained side by side
 in one program, or with --one-by-one one after another, which is how wall-clock times to a success are meant to be
 taken. Into the folder go
 
@@ -13,7 +13,8 @@ taken. Into the folder go
     curves.png    success_any over env steps and over wall-clock: mean over seeds and their range
     table.md      means over seeds and interquartile means with 95 % bootstrap intervals
 
-A name whose JSON exists is not trained again. Runs are kept under `--runs`.
+A name whose JSON exists is not trained again. Runs are kept under `--runs`; one that was interrupted goes on, so empty
+that folder when code or settings have changed.
 """
 
 from __future__ import annotations
@@ -61,7 +62,9 @@ def measure(task: str, name: str, options: argparse.Namespace, settings: list[st
         run = options.runs / task / f"{name}-{seeds[0]}"
         chosen = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), *settings]
         train = ["train", f"configs/{task}.yaml", *layer(name), *chosen, "--run-dir", str(run)]
-        if not (run / "figures" / "summary.png").exists():
+        if (run / "checkpoints").exists():  # interrupted, or done
+            subprocess.run([*STAR, "train", "--resume", str(run)], cwd=ROOT, check=True)
+        else:
             subprocess.run([*STAR, *train], cwd=ROOT, check=True)
         commands.append(shlex.join(["star", *train]))
         rows += [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
@@ -169,7 +172,9 @@ def draw(curves: list[dict[str, Any]], path: Path) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Fill the folder of one task."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
     parser.add_argument("task")
     parser.add_argument("names", nargs="*", default=AGENTS)
     parser.add_argument("--seeds", type=int, default=5)
@@ -177,7 +182,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--one-by-one", action="store_true")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--runs", type=Path, default=Path("runs/reproduce"))
-    options, settings = parser.parse_known_args(arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    end = given.index("--") if "--" in given else len(given)
+    options, settings = parser.parse_intermixed_args(given[:end]), given[end + 1 :]
     if not (ROOT / "configs" / f"{options.task}.yaml").is_file():
         raise SystemExit(f"error: configs/{options.task}.yaml: no such file")
     options.runs = options.runs.resolve()

@@ -127,6 +127,11 @@ def epsilon(config: CommanderConfig, env_steps: Float[Array, ""]) -> Float[Array
     return config.epsilon_start + progress * (config.epsilon_end - config.epsilon_start)
 
 
+def practice(config: CommanderConfig) -> Float[Array, ""] | float:
+    """Share of the environments that practise: none without a Commander, since there is nobody to send them."""
+    return config.practice if config.enabled else 0.0
+
+
 def act(
     state: CommanderState,
     allowed: Successors,
@@ -160,10 +165,12 @@ def observe(config: CommanderConfig, state: CommanderState, allowed: Successors,
     if state.model is None:
         return _q_learning(config, state, allowed, batch)
     cell = (batch.region, batch.goal_region, batch.target)
+    # Who practises and aims at the goal's region aims at its centre, which tells nothing of aiming at the goal.
+    telling = batch.weight * (1 - batch.practised * (batch.target == batch.goal_region))
     model = state.model.replace(
         led=state.model.led.at[batch.region, batch.target, batch.next_region].add(batch.weight),
-        rewards=state.model.rewards.at[cell].add(batch.weight * batch.reward),
-        visits=state.model.visits.at[cell].add(batch.weight),
+        rewards=state.model.rewards.at[cell].add(telling * batch.reward),
+        visits=state.model.visits.at[cell].add(telling),
         lost=state.model.lost.at[batch.region, batch.target].add(batch.lost),
     )
     return state.replace(model=model)

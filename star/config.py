@@ -194,6 +194,12 @@ class TutorConfig(LevelConfig):
     adjacency: AdjacencyConfig = AdjacencyConfig()
 
     @model_validator(mode="after")
+    def _adjacency_needs_a_tutor(self) -> Self:
+        if self.adjacency.enabled and not self.enabled:
+            raise ValueError("adjacency.enabled needs a Tutor, whose subgoals it is about")
+        return self
+
+    @model_validator(mode="after")
     def _correction_needs_replay(self) -> Self:
         if self.off_policy_correction and self.learner != "td3":
             raise ValueError("off_policy_correction needs learner td3, which replays old subgoals")
@@ -295,7 +301,7 @@ class Config(Section):
         for name, section in (("tutor", self.tutor), ("controller", self.controller)):
             decisions = self.tutor.unroll if name == "tutor" else self.tutor.period
             rollout = decisions * self.trainer.num_envs
-            if section.learner == "ppo" and rollout % section.ppo.minibatches:
+            if getattr(section, "enabled", True) and section.learner == "ppo" and rollout % section.ppo.minibatches:
                 raise ValueError(
                     f"{name}.ppo.minibatches: {section.ppo.minibatches} does not divide the rollout of {rollout} "
                     f"decisions ({decisions} of each of {self.trainer.num_envs} environments)"

@@ -40,7 +40,7 @@ Metrics = dict[str, Array]
 def epoch(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState) -> tuple[TrainState, Metrics]:
     """One episode of all environments, its updates, one refinement."""
     key, reset_key, scan_key, end_key = jax.random.split(state.key, 4)
-    streams = episode.start(spec, env, practice=config.commander.practice, key=reset_key)
+    streams = episode.start(spec, env, practice=commander.practice(config.commander), key=reset_key)
     segments = spec.episode_length // config.tutor.period
     blocks = (segments // config.tutor.unroll, config.tutor.unroll)
     (state, streams), (outcomes, metrics, counts) = jax.lax.scan(
@@ -159,11 +159,12 @@ def _learn_between_episodes(
     )
     periods = num_envs * (spec.episode_length // config.commander.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
+    at_goal = (decision.target == decision.goal_region) & (decision.practised == 0)
+    goals = refinement.Goals.of(outcome, at_goal, radius=spec.success_radius)
     if config.forward_model.boxes == "reached":
         lower, upper = (corner[decision.next_region] for corner in (state.abstraction.lower, state.abstraction.upper))
         outcome = outcome.replace(lower=lower, upper=upper)
     error = forward_model.errors(config.forward_model, state.forward_model, outcome)
-    at_goal = (decision.target == decision.goal_region) & (decision.practised == 0)
     counted = outcome.weight * (at_goal == (decision.region == decision.target))
     graph = refinement.observe(
         config, state.graph, region=decision.region, target=decision.target, error=error, weight=counted
@@ -172,7 +173,6 @@ def _learn_between_episodes(
     state = state.replace(forward_model=model, graph=graph)
     refine_metrics: Metrics = {}
     if config.refinement.enabled:
-        goals = refinement.Goals.of(outcome, at_goal, radius=spec.success_radius)
         state, refine_metrics = refine(config, spec, state, goals, key=refine_key)
     state = state.replace(commander=commander.fade(config.commander, state.commander))
     metrics = (
@@ -226,8 +226,12 @@ def _in_hindsight(config: AgentConfig, spec: Spec, batch: Transition, key: Array
     """Half of the replayed transitions as if what the agent reached had been its subgoal (Andrychowicz et al. 2017)."""
     d = len(spec.abstract_indices)
     size = d if config.tutor.enabled else 2 * d
-    reached = jnp.concatenate([batch.extras] * (size // d), axis=-1)
+    margin = config.commander.goal_margin
+    reached = batch.extras
+    if size != d:
+        reached = jnp.concatenate([reached - margin, reached + margin], axis=-1)
     before, after = reached[:, 0], reached[:, 1]
+    price = config.controller.termination_penalty * batch.terminated
     replaced = jax.random.bernoulli(key, 0.5, batch.reward.shape)
 
     def pick(new: Array, old: Array) -> Array:
@@ -236,7 +240,7 @@ def _in_hindsight(config: AgentConfig, spec: Spec, batch: Transition, key: Array
     return batch.replace(
         obs=pick(batch.obs.at[:, -size:].set(before), batch.obs),
         next_obs=pick(batch.next_obs.at[:, -size:].set(after), batch.next_obs),
-        reward=pick(controller.reward(config.controller, before, after, size=d), batch.reward),
+        reward=pick(controller.reward(config.controller, before, after, size=d) - price, batch.reward),
     )
 
 
@@ -314,7 +318,7 @@ def _penalty(config: AgentConfig, spec: Spec, state: TrainState) -> Penalty:
 
     def price(batch: Transition, action: Array) -> Array:
         start = batch.extras.achieved[..., 0, :] if config.tutor.off_policy_correction else batch.extras
-        return adjacency.penalty(config.tutor.adjacency, known, start, tutor.subgoal(action, spec.scale))
+        return adjacency.penalty(config.tutor.adjacency, known, start, action * spec.scale)
 
     return price
 

@@ -148,8 +148,8 @@ def record_run(
     vector, spec = VectorEnv(env, envs, auto_reset=False), program.spec
 
     def record(env_state: Any, subgoal: jax.Array, box: Box) -> Moments:
-        here = spec.abstract(env_state.obs)
-        return _look(env, env_state).replace(subgoal=here + subgoal, lower=box.lower, upper=box.upper)
+        aim = box.centre if state.tutor is None else spec.abstract(env_state.obs) + subgoal
+        return _look(env, env_state).replace(subgoal=aim, lower=box.lower, upper=box.upper)
 
     def play(agent: Any, state: Any, key: jax.Array) -> tuple[Moments, Moments]:
         streams, moments = episode.play(agent, spec, vector, state, record=record, key=key)
@@ -160,7 +160,7 @@ def record_run(
     moments = jax.tree.map(lambda leaf: leaf[: length + 1], _joined(*played))
     count = int(state.abstraction.count)
     regions = np.asarray(state.abstraction.lower[:count]), np.asarray(state.abstraction.upper[:count])
-    return Recording(env, moments, regions)
+    return Recording(env, moments, regions if config.commander.enabled else None)
 
 
 def moments_shown(total: int, show: Show) -> list[int]:

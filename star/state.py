@@ -153,12 +153,12 @@ def check(config: Config, spec: Spec) -> None:
         ("controller", config.controller, config.tutor.period),
     ):
         rollout = decisions * config.trainer.num_envs
-        if section.learner == "td3" and section.td3.buffer_size < rollout:
+        if getattr(section, "enabled", True) and section.learner == "td3" and section.td3.buffer_size < rollout:
             raise ValueError(f"{name}.td3.buffer_size: {section.td3.buffer_size} is below one rollout of {rollout}")
     try:
         regions.create(spec.space, first_cuts(config, spec), max_regions=config.abstraction.max_regions)
     except ValueError as error:
-        raise ValueError(f"abstraction.cuts: {error}") from None
+        raise ValueError(f"abstraction.{'cuts' if config.abstraction.grid is None else 'grid'}: {error}") from None
 
 
 def _examples(config: AgentConfig, spec: Spec) -> tuple[Transition, Transition]:

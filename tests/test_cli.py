@@ -74,6 +74,10 @@ def refusal(capsys, folder, arguments):
     ("arguments", "said"),
     [
         pytest.param("train point.yaml --commander.perod 5", "commander.period?", id="misspelt key"),
+        pytest.param("train point.yaml --with no.yaml", "no.yaml: no such file", id="missing layer"),
+        pytest.param(
+            "train --resume run --with point.yaml", "--with: a resumed run keeps", id="layer on a resumed run"
+        ),
         pytest.param("train point.yaml --comander.period 5", "commander?", id="misspelt section"),
         pytest.param("train point.yaml --tutor.period ten", "tutor.period: 'ten' is not allowed", id="wrong type"),
         pytest.param("train point.yaml --tutor.ppo 5", "tutor.ppo: 5 is not allowed", id="section as a value"),
@@ -173,6 +177,14 @@ def test_a_run_is_named_after_its_config_file_and_the_time(calls):
     assert main(["train", "point.yaml"]) == 0
     run_dir = calls[0]["run_dir"]
     assert run_dir.parent == Path("runs") and run_dir.name.startswith("point-")
+
+
+def test_layers_lie_over_the_file_and_name_the_run(calls, folder):
+    (folder / "calm.yaml").write_text("commander: {practice: 0}")
+    assert main("train point.yaml --with calm.yaml --commander.period 60".split()) == 0
+    config, run_dir = calls[0]["config"], calls[0]["run_dir"]
+    assert (config.commander.practice, config.commander.period) == (0, 60)
+    assert run_dir.name.startswith("point-calm-")
 
 
 def test_a_finished_run_says_where_its_results_are(calls, capsys):

@@ -97,8 +97,9 @@ def slow_plan(batch, allowed, believed, hoped, *, discount, prior, sweeps):
         i, g, j = batch.region[n], batch.goal_region[n], batch.target[n]
         led[i, j, batch.next_region[n]] += batch.weight[n]
         led[i, j, R] += batch.lost[n]  # a state that is worth nothing
-        reward[i, g, j] += batch.weight[n] * batch.reward[n]
-        visits[i, g, j] += batch.weight[n]
+        if not (batch.practised[n] and j == g):
+            reward[i, g, j] += batch.weight[n] * batch.reward[n]
+            visits[i, g, j] += batch.weight[n]
     for _ in range(sweeps):
         value, chance = np.zeros((2, R + 1, R))
         for i in range(R):
@@ -304,3 +305,8 @@ def test_a_new_region_inherits_rows_columns_and_half_the_visits_of_its_parent():
     np.testing.assert_array_equal(after.model.lost, np.asarray(q[0])[np.ix_(who, who)])
     np.testing.assert_array_equal(after.q, np.asarray(q)[np.ix_(who, who, who)])
     np.testing.assert_array_equal(after.chosen, [1, 1, 3, 1, 5])
+
+
+def test_nobody_practises_without_a_commander():
+    assert commander.practice(settings(practice=0.3)) == 0.3
+    assert commander.practice(settings(practice=0.3, enabled=False)) == 0.0

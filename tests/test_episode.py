@@ -1,9 +1,11 @@
 """The clocks of the levels, the moving subgoal and the statistics, against loops written from the equations."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import star.state
 from star import abstraction as regions
 from star import config, episode
 from star.state import Spec
@@ -209,3 +211,27 @@ def test_dimensions_that_the_goal_leaves_open_keep_the_bounds_of_the_region(tiny
     box = episode.target_box(config.parse(tiny).agent(), spec, made, region, jnp.array([True]), point)
     np.testing.assert_array_equal(box.lower, [[5, 6, 4]])
     np.testing.assert_array_equal(box.upper, [[7, 8, 8]])
+
+
+@pytest.mark.parametrize("hold", [True, False])
+def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_env, tiny, hold):
+    agent = config.parse(tiny, {"commander.hold": hold}).agent()
+    spec = Spec.of(breaking_env.env)
+
+    def commanded(key):
+        state = star.state.init(agent, spec, key=key)
+        away = jnp.zeros_like(state.commander.q).at[..., 2].set(1.0)  # everybody is sent to region 2
+        state = state.replace(commander=state.commander.replace(q=away))
+        streams = episode.start(spec, breaking_env, key=key)
+        success = (jnp.arange(B) < 4).astype(jnp.float32)
+        arrived = streams.env.replace(metrics=streams.env.metrics | {"success": success})
+        streams = streams.replace(env=arrived, practice=jnp.where(jnp.arange(B) % 4 == 3, 2, -1))
+        allowed = episode.successors(agent, state)
+        return episode.command(agent, spec, state, allowed, streams, epsilon=0.0, key=key)
+
+    got = jax.jit(commanded)(jax.random.key(3))
+    at_goal = np.asarray(got.target == got.goal_region)
+    sent = np.asarray(got.target) == 2
+    assert (np.asarray(got.goal_region) != 2).all()
+    assert sent[[4, 5, 6]].all()
+    np.testing.assert_array_equal(at_goal[:3], [hold] * 3)

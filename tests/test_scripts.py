@@ -1,8 +1,19 @@
 import argparse
 import importlib.util
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax
+import numpy as np
+import pytest
+
+import star.state
 from envs.arena import Arena
+from star import config
+from star.commander import Decision
+from star.forward_model import Outcome
+from star.reachability import MISSES, REACHES
+from star.state import Spec
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -41,3 +52,79 @@ def test_the_benchmark_measures_both_loops():
     options = argparse.Namespace(preset="fast", steps=3, repeats=2)
     row = script.measure("ant_maze", "native", 4, options)
     assert row["bare"] > 0 and row["full"] > 0 and len(row["ratios"]) == 2
+
+
+def report(name, finals, *, to_level):
+    seeds = [
+        {"seed": i, "success_any": 1.0, "success_final": final, "env_steps_to_level": steps, "seconds_to_level": steps}
+        for i, (final, steps) in enumerate(zip(finals, to_level, strict=True))
+    ]
+    return {"name": name, "seeds": seeds, "env_steps_per_seed": 2_500_000}
+
+
+def test_the_table_tells_means_over_seeds_with_intervals_and_who_never_got_there():
+    script = load("reproduce")
+    text = script.table(
+        [
+            report("star", [0.0, 1.0, 1.0, 1.0, 1.0], to_level=[3e6, 1e6, 2e6, 9e6, None]),
+            report("flat", [0.0] * 5, to_level=[1e6, None, None, None, 1e6]),
+        ]
+    )
+    star, flat = (line.split(" | ") for line in text.splitlines()[2:])
+    assert star[1:4] == ["5", "2.5 M", "1.00 [1.00, 1.00]"]
+    assert star[4].startswith("0.80 [") and star[5].startswith("1.00 [") and star[6] == "3.0 M"
+    assert flat[4] == "0.00 [0.00, 0.00]" and flat[6] == "never"
+    low, high = (float(x) for x in star[4][6:-1].split(","))
+    assert low < 0.8 < high <= 1
+
+
+def test_the_interval_covers_the_mean_of_normal_seeds_about_as_often_as_it_says():
+    script, rng = load("reproduce"), np.random.default_rng(0)
+    found = [script.interval(list(rng.normal(size=20)), np.mean)[1:] for _ in range(100)]
+    assert 85 <= sum(low < 0 < high for low, high in found) <= 99
+
+
+def test_agents_and_ablations_are_found_and_others_refused():
+    script = load("reproduce")
+    assert script.layer("star") == []
+    assert script.layer("hiro") == ["--with", "configs/agents/hiro.yaml"]
+    assert script.layer("grid") == ["--with", "configs/ablations/grid.yaml"]
+    with pytest.raises(SystemExit, match="hirro: no such agent; known are star, "):
+        script.layer("hirro")
+
+
+def test_curves_are_drawn(tmp_path):
+    points = [
+        {"name": name, "seed": seed, "env_steps": step, "wall_s": step / 100, "eval/success_any": 0.5}
+        for name in ("star", "flat")
+        for seed in (0, 1)
+        for step in (100, 200)
+    ]
+    load("reproduce").draw(points, tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
+    script = load("verify_abstraction")
+    spec = Spec.of(breaking_env.env)
+    agent = config.parse(tiny, {"abstraction.cuts": [[8.0], [8.0]]}).agent()
+    state = star.state.init(agent, spec, key=jax.random.key(0))
+    verdict = state.graph.verdict.at[0, 1].set(REACHES).at[1, 0].set(MISSES)
+    state = state.replace(graph=state.graph.replace(verdict=verdict))
+    # (region, target, next region): 0 -> 1 is right in 3 of 4 rollouts, 1 -> 0 in 1 of 2, and one does not count.
+    seen = np.array([(0, 1, 1), (0, 1, 1), (0, 1, 1), (0, 1, 0), (1, 0, 1), (1, 0, 0), (2, 3, 2), (0, 1, 0), (2, 2, 2)])
+    region, target, next_region = seen.T
+    weight = np.array([1, 1, 1, 1, 1, 1, 1, 0, 1], np.float32)
+    point = np.zeros((9, 2), np.float32)
+    finished = (
+        SimpleNamespace(region=region, target=target, next_region=next_region, weight=weight),
+        Outcome(start=point, lower=point, upper=point, end=point + 3, weight=weight),
+    )
+    stacked = jax.tree.map(lambda x: x[None], (vars(finished[0]), finished[1]))
+    decision = Decision(**stacked[0], goal_region=None, reward=None, lost=None, practised=None)
+    walls = np.array([[2.0, -99.0, 7.5, 99.0]])
+    row = script.judge(agent, spec, state, (decision, stacked[1]), walls)
+    assert row["reaches"] == {"share": 0.75, "rollouts": 4, "pairs": 1}
+    assert row["misses"] == {"share": 0.5, "rollouts": 2, "pairs": 1}
+    assert row["base"]["rollouts"] == 7 and row["error"]["still"] == pytest.approx(18**0.5)
+    assert row["walls"]["share"] == 0.5  # of 4 faces, 2 at x = 8 beside the wall's side at 7.5 and 2 at y = 8
