@@ -13,7 +13,6 @@ Source: HRAC (Zhang et al., NeurIPS 2020), sections 4.2 and 4.3.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 import jax
@@ -24,7 +23,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from star.config import AdjacencyConfig
-from star.networks import MLP, apply
+from star.networks import MLP, apply, descend
 
 Metrics = dict[str, Array]
 
@@ -91,25 +90,24 @@ def train(
     visited = state.adjacent.any(axis=1)
     centre = _centres(config, space)
 
-    def step(carry: tuple, step_key: Array) -> tuple[tuple, Array]:
-        params, optimizer = carry
+    def loss(params: Any, step_key: Array) -> Array:
         anchor_key, near_key, far_key = jax.random.split(step_key, 3)
         anchor = _draw(jnp.broadcast_to(visited, (config.batch_size, visited.shape[0])), anchor_key)
         near = _draw(state.adjacent[anchor], near_key)
         others = visited & ~state.adjacent[anchor]
         far = _draw(others, far_key)
-        weight = others.any(axis=1)
-        loss, gradient = jax.value_and_grad(partial(_loss, config))(
-            params, centre[anchor], centre[near], centre[far], weight, visited.any()
-        )
-        change, optimizer = optax.scale_by_adam().update(gradient, optimizer)
-        return (jax.tree.map(lambda p, c: p - config.learning_rate * c, params, change), optimizer), loss
+        known = visited.any()
+        return _loss(config, params, centre[anchor], centre[near], centre[far], others.any(axis=1), known)
 
-    (params, optimizer), losses = jax.lax.scan(
-        step, (state.params, state.optimizer), jax.random.split(key, config.updates_per_epoch)
+    params, optimizer, mean_loss = descend(
+        loss,
+        state.params,
+        state.optimizer,
+        learning_rate=config.learning_rate,
+        keys=jax.random.split(key, config.updates_per_epoch),
     )
     share = state.adjacent.sum() / jnp.maximum(jnp.square(visited.sum()), 1)
-    return state.replace(params=params, optimizer=optimizer), {"loss": losses.mean(), "share": share}
+    return state.replace(params=params, optimizer=optimizer), {"loss": mean_loss, "share": share}
 
 
 def penalty(

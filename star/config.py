@@ -298,15 +298,19 @@ class Config(Section):
             raise ValueError(
                 f"commander.period: {self.commander.period} is not a multiple of tutor.period {self.tutor.period}"
             )
-        for name, section in (("tutor", self.tutor), ("controller", self.controller)):
-            decisions = self.tutor.unroll if name == "tutor" else self.tutor.period
+        for name, section, decisions in self.learners():
             rollout = decisions * self.trainer.num_envs
-            if getattr(section, "enabled", True) and section.learner == "ppo" and rollout % section.ppo.minibatches:
+            if section.learner == "ppo" and rollout % section.ppo.minibatches:
                 raise ValueError(
                     f"{name}.ppo.minibatches: {section.ppo.minibatches} does not divide the rollout of {rollout} "
                     f"decisions ({decisions} of each of {self.trainer.num_envs} environments)"
                 )
         return self
+
+    def learners(self) -> list[tuple[str, LevelConfig, int]]:
+        """The levels that learn from rollouts: name, section, and decisions of each environment in a rollout."""
+        tutor = [("tutor", self.tutor, self.tutor.unroll)] if self.tutor.enabled else []
+        return [*tutor, ("controller", self.controller, self.tutor.period)]
 
     def agent(self) -> AgentConfig:
         """The sections that the jitted program sees."""

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from star import replay
 from star.config import ForwardModelConfig
-from star.networks import MLP, apply
+from star.networks import MLP, apply, descend
 from star.reachability import Network
 
 Metrics = dict[str, Array]
@@ -104,18 +104,17 @@ def train(
     """Store the outcomes `fresh` [N] and make `updates_per_epoch` updates on batches of the buffer."""
     state = state.replace(ring=replay.add(state.ring, fresh))
 
-    def step(carry: tuple, step_key: Array) -> tuple[tuple, Array]:
-        params, optimizer = carry
-        batch = replay.sample(state.ring, step_key, batch_size=config.batch_size)
-        loss, gradient = jax.value_and_grad(partial(_loss, config))(params, state.space, batch)
-        change, optimizer = optax.scale_by_adam().update(gradient, optimizer)
-        params = jax.tree.map(lambda p, c: p - config.learning_rate * c, params, change)
-        return (params, optimizer), loss
+    def loss(params: Any, step_key: Array) -> Array:
+        return _loss(config, params, state.space, replay.sample(state.ring, step_key, batch_size=config.batch_size))
 
-    (params, optimizer), losses = jax.lax.scan(
-        step, (state.params, state.optimizer), jax.random.split(key, config.updates_per_epoch)
+    params, optimizer, mean_loss = descend(
+        loss,
+        state.params,
+        state.optimizer,
+        learning_rate=config.learning_rate,
+        keys=jax.random.split(key, config.updates_per_epoch),
     )
-    return state.replace(params=params, optimizer=optimizer), {"loss": losses.mean()}
+    return state.replace(params=params, optimizer=optimizer), {"loss": mean_loss}
 
 
 def visited(state: ForwardModelState) -> tuple[Float[Array, "N d"], Float[Array, "N"]]:

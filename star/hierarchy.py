@@ -138,14 +138,17 @@ def _command_better(
     learnt = commander.observe(config.commander, state.commander, allowed, decision)
     if learnt.model is None:
         return learnt
-    believed = regions.adjacent(state.abstraction)
-    if config.commander.successors != "all":
-        believed = state.graph.reaches | (believed & ~state.graph.misses)
-    centre = regions.centre(state.abstraction)
-    apart = jnp.linalg.norm(centre[:, None] - centre, axis=-1)
-    hoped = commander.worth(config.commander, apart, 0.0, spec.diameter)
+
+    def plan(learnt: CommanderState) -> CommanderState:
+        believed = regions.adjacent(state.abstraction)
+        if config.commander.successors != "all":
+            believed = state.graph.reaches | (believed & ~state.graph.misses)
+        centre = regions.centre(state.abstraction)
+        apart = jnp.linalg.norm(centre[:, None] - centre, axis=-1)
+        hoped = commander.worth(config.commander, apart, 0.0, spec.diameter)
+        return commander.plan(config.commander, learnt, allowed, believed=believed, hoped=hoped)
+
     period = config.commander.period // config.tutor.period
-    plan = partial(commander.plan, config.commander, allowed=allowed, believed=believed, hoped=hoped)
     return jax.lax.cond(number % period == period - 1, plan, lambda same: same, learnt)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import optax
 from flax import struct
 from jaxtyping import Array, Float
 
@@ -36,6 +37,26 @@ class MLP(nn.Module):
 def apply(mlp: MLP, params: Any, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
     """Output of `mlp` with `params` for the last axis of `x`."""
     return jnp.asarray(mlp.apply(params, x))
+
+
+def descend(
+    loss: Callable[[Any, Array], Array],
+    params: Any,
+    optimizer: optax.OptState,
+    *,
+    learning_rate: float | Array,
+    keys: Array,
+) -> tuple[Any, optax.OptState, Float[Array, ""]]:
+    """One Adam step on `loss(params, key)` for each of `keys`: params, state of the optimiser, and the mean loss."""
+
+    def step(carry: tuple, key: Array) -> tuple[tuple, Array]:
+        params, optimizer = carry
+        value, gradient = jax.value_and_grad(loss)(params, key)
+        change, optimizer = optax.scale_by_adam().update(gradient, optimizer)
+        return (jax.tree.map(lambda p, c: p - learning_rate * c, params, change), optimizer), value
+
+    (params, optimizer), losses = jax.lax.scan(step, (params, optimizer), keys)
+    return params, optimizer, losses.mean()
 
 
 class Normalizer(struct.PyTreeNode):

@@ -148,12 +148,9 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(
             f"abstraction.grid: {list(grid)} has more parts than there are abstract dimensions, {dimensions}"
         )
-    for name, section, decisions in (
-        ("tutor", config.tutor, config.tutor.unroll),
-        ("controller", config.controller, config.tutor.period),
-    ):
+    for name, section, decisions in config.learners():
         rollout = decisions * config.trainer.num_envs
-        if getattr(section, "enabled", True) and section.learner == "td3" and section.td3.buffer_size < rollout:
+        if section.learner == "td3" and section.td3.buffer_size < rollout:
             raise ValueError(f"{name}.td3.buffer_size: {section.td3.buffer_size} is below one rollout of {rollout}")
     try:
         regions.create(spec.space, first_cuts(config, spec), max_regions=config.abstraction.max_regions)

@@ -282,7 +282,7 @@ def _resolve(config: Config, engine: str, spec: Spec) -> Config:
     values["env"]["engine"] = engine
     if "map" in values["env"]["options"]:  # the run must not change with the file
         values["env"]["options"]["map"] = arena.load(values["env"]["options"]["map"])
-    if values["abstraction"]["cuts"] is None:
+    if values["abstraction"]["cuts"] is None and values["abstraction"]["grid"] is None:
         values["abstraction"]["cuts"] = spec.region_cuts
     return parse(values)
 
