@@ -127,6 +127,7 @@ def _add_block(world: Any, name: str, centre: np.ndarray, arena: Arena) -> None:
             limited=True,
             range=reach,
             margin=0.0,
+            solimp_limit=[*BLOCK_SOLIMP, 0.5, 2.0],
         )
 
 

@@ -66,8 +66,13 @@ class Checkpoints:
         return parse(saved["config"], source=str(self._path / str(step)))
 
     def restore(self, step: int, example: TrainState) -> TrainState:
-        """The state saved at `step`; `example` (arrays or their shapes) gives the structure it must have."""
-        template = jax.tree.map(ocp.utils.to_shape_dtype_struct, jax.eval_shape(_plain, example))
+        """The state saved at `step`, on the first device here, whatever it was saved on.
+
+        `example` (arrays or their shapes) gives the structure it must have.
+        """
+        here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        shapes = jax.eval_shape(_plain, example)
+        template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), shapes)
         try:
             args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
             saved = self._open().restore(step, args=args)["state"]

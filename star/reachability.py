@@ -46,11 +46,12 @@ class Zonotope(struct.PyTreeNode):
 
 
 class Leaves(struct.PyTreeNode):
-    """The 2^depth equal parts of an examined box, and whether each was shown to reach the target."""
+    """The 2^depth equal parts of an examined box, whether each was shown to reach the target, and seen enough."""
 
     lower: Float[Array, "L d"]
     upper: Float[Array, "L d"]
     reaches: Bool[Array, "L"]
+    visited: Bool[Array, "L"]
 
 
 def from_box(lower: Float[Array, "n"], upper: Float[Array, "n"]) -> Zonotope:
@@ -174,23 +175,36 @@ def examine(
     def visited(lower: Array, upper: Array) -> Bool[Array, ""]:
         return jnp.sum(jnp.all((lower <= starts) & (starts < upper), axis=-1) * seen) >= min_visits
 
-    def verdict(lower: Array, upper: Array) -> Int[Array, ""]:
+    def verdict(lower: Array, upper: Array) -> tuple[Int[Array, ""], Bool[Array, ""]]:
         found = judge(*hull(network, lower, upper), target, reach_share=reach_share, miss_share=miss_share)
-        return jnp.where((found == REACHES) & ~visited(lower, upper), MISSES, found)
+        seen = visited(lower, upper)
+        return jnp.where((found == REACHES) & ~seen, MISSES, found), seen
 
     lower, upper = box[0][None], box[1][None]
-    found = jax.vmap(verdict)(lower, upper)
+    found, enough = jax.vmap(verdict)(lower, upper)
     for _ in range(depth):
         lower, upper = jax.vmap(lambda lo, hi: _halve(network, lo, hi))(lower, upper)
         lower, upper = lower.reshape(-1, lower.shape[-1]), upper.reshape(-1, upper.shape[-1])
-        inherited = jnp.repeat(found, 2)
-        found = jnp.where(inherited == UNKNOWN, jax.vmap(verdict)(lower, upper), inherited)
-    return Leaves(lower=lower, upper=upper, reaches=found == REACHES)
+        inherited, same = jnp.repeat(found, 2), jnp.repeat(enough, 2)
+        open_ = inherited == UNKNOWN
+        found, enough = jax.vmap(verdict)(lower, upper)
+        found, enough = jnp.where(open_, found, inherited), jnp.where(open_, enough, same)
+    return Leaves(lower=lower, upper=upper, reaches=found == REACHES, visited=enough)
 
 
 def summary(leaves: Leaves) -> Int[Array, ""]:
     """REACHES if all leaves reach, MISSES if none does, else MIXED."""
-    return jnp.where(leaves.reaches.all(), REACHES, jnp.where(leaves.reaches.any(), MIXED, MISSES))
+    return _verdict(leaves.reaches, jnp.ones_like(leaves.reaches))
+
+
+def summary_of_visited(leaves: Leaves) -> Int[Array, ""]:
+    """The same of the visited leaves alone; UNKNOWN if there are none."""
+    return jnp.where(leaves.visited.any(), _verdict(leaves.reaches, leaves.visited), UNKNOWN)
+
+
+def _verdict(reaches: Bool[Array, "L"], counted: Bool[Array, "L"]) -> Int[Array, ""]:
+    some, all_ = (reaches & counted).any(), (reaches | ~counted).all()
+    return jnp.where(all_, REACHES, jnp.where(some, MIXED, MISSES))
 
 
 def _halve(network: Network, lower: Float[Array, "d"], upper: Float[Array, "d"]) -> tuple[Array, Array]:

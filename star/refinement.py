@@ -4,10 +4,11 @@
         it was commanded `min_transitions` times since i or j last changed,
         it has no verdict, and
         the forward model's held-out error on it has stopped falling
-    the due pair commanded most is examined (star/reachability.py):
+    the due pair that has waited longest is examined (star/reachability.py):
         all parts of i reach j:  edge i -> j, REACHES
         none does:               MISSES, for `miss_lifetime` epochs, since the low levels are still learning
         some do:                 cut i along the axis that best parts the reaching from the missing leaves
+    if no cut is possible, the parts of i where agents have been decide: all of them, none, or no verdict
 
 With `within`, pairs (i, i) are examined too: does a region reach the goals inside it? They count decisions of agents
 in i whose goal lies in i. One of their goals is drawn, if possible one that was reached, and the square inside its
@@ -202,7 +203,8 @@ def refine(
     def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
         abstraction, graph = carry
         waiting = due(config, graph, abstraction.active)
-        region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, graph.transitions, -1.0)), waiting.shape)
+        share = graph.transitions / (1 + graph.transitions.max())  # of the pairs that wait as long, the most commanded
+        region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, graph.age + share, -1.0)), waiting.shape)
         found = waiting[region, target]
         inside = region == target
         goal_key, cut_key = jax.random.split(pair_key)
@@ -216,9 +218,7 @@ def refine(
         wanted = (commanded[0] - widened, commanded[1] + widened)
         leaves = _examine(config, abstraction, model, region, commanded, wanted, starts, seen)
         verdict = reachability.summary(leaves)
-        settled = judged & (verdict != MIXED) & ~inside
         graph = graph.replace(
-            verdict=graph.verdict.at[region, target].set(jnp.where(settled, verdict, graph.verdict[region, target])),
             age=graph.age.at[region, target].set(jnp.where(found, 0, graph.age[region, target])),
             transitions=graph.transitions.at[region, target].multiply(
                 jnp.where(found, jnp.where(inside, 0.5, 0.0), 1.0)  # another goal may be drawn
@@ -226,6 +226,10 @@ def refine(
         )
         mixed = judged & (verdict == MIXED)
         abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed, key=cut_key)
+        verdict = jnp.where(mixed & ~splits.done.any(), reachability.summary_of_visited(leaves), verdict)
+        settled = judged & ~inside & ((verdict == REACHES) | (verdict == MISSES))
+        known = jnp.where(settled, verdict, graph.verdict[region, target])
+        graph = graph.replace(verdict=graph.verdict.at[region, target].set(known))
         return (abstraction, graph), (splits, found, mixed)
 
     (abstraction, graph), (splits, found, mixed) = jax.lax.scan(

@@ -164,6 +164,7 @@ def test_starts_count_for_the_part_they_lie_in(examine):
     starts[:5, 0] = 2.0  # a start on the cut belongs to the upper half
     leaves = examine(box, target, starts=starts, min_visits=5)
     np.testing.assert_array_equal(leaves.reaches, np.asarray(leaves.lower)[:, 0] >= 2)
+    assert leaves.visited[np.asarray(leaves.lower)[:, 0] >= 2].all() and not leaves.visited.all()
 
 
 @pytest.mark.parametrize(
@@ -171,5 +172,22 @@ def test_starts_count_for_the_part_they_lie_in(examine):
     [((True, True), REACHES), ((False, False), MISSES), ((True, False), MIXED), ((False, True), MIXED)],
 )
 def test_summary_of_leaves(reaches, verdict):
-    corners = jnp.zeros((2, 1))
-    assert int(reachability.summary(Leaves(lower=corners, upper=corners, reaches=jnp.array(reaches)))) == verdict
+    assert int(reachability.summary(leaves_of(reaches, (True, False)))) == verdict
+
+
+@pytest.mark.parametrize(
+    ("reaches", "visited", "verdict"),
+    [
+        ((True, False), (True, False), REACHES),
+        ((True, False), (False, True), MISSES),
+        ((True, False), (True, True), MIXED),
+        ((True, True), (False, False), UNKNOWN),
+    ],
+)
+def test_summary_of_the_leaves_where_agents_have_been(reaches, visited, verdict):
+    assert int(reachability.summary_of_visited(leaves_of(reaches, visited))) == verdict
+
+
+def leaves_of(reaches, visited):
+    corners = jnp.zeros((len(reaches), 1))
+    return Leaves(lower=corners, upper=corners, reaches=jnp.array(reaches), visited=jnp.array(visited))

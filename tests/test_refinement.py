@@ -191,7 +191,7 @@ def test_the_best_cut_is_that_of_a_brute_force_gini_search(best_cut, seed):
             for position in np.unique(upper[:, dimension]):
                 if low[dimension] + 2 <= position <= high[dimension] - 2:
                     best = max(best, slow_gain(low, high, leaves, dimension, position))
-    given = Leaves(jnp.float32(lower), jnp.float32(upper), jnp.asarray(reaches))
+    given = Leaves(jnp.float32(lower), jnp.float32(upper), jnp.asarray(reaches), jnp.ones(len(reaches), bool))
     cut, gain = best_cut(abstraction, jnp.isin(jnp.arange(R), jnp.array(candidates)), given, 2.0)
     np.testing.assert_allclose(gain, best, rtol=1e-4, atol=1e-6)
     assert best > 0 and int(cut.region) in candidates
@@ -249,9 +249,14 @@ def test_the_parts_get_verdicts_and_a_miss_is_examined_again_after_its_lifetime(
     ]
 
 
-def test_the_pair_commanded_most_is_examined_first(refine, moving):
+@pytest.mark.parametrize(("quantity", "much"), [("transitions", 500.0), ("age", 1)])
+def test_the_pair_that_has_waited_longest_is_examined_first_of_equals_the_one_commanded_most(
+    refine, moving, quantity, much
+):
     graph = knowing((0, 2), (1, 3))
-    graph = graph.replace(transitions=graph.transitions.at[1, 3].set(500.0))
+    if quantity == "age":  # although the other one was commanded more often
+        graph = graph.replace(transitions=graph.transitions.at[0, 2].set(500.0))
+    graph = graph.replace(**{quantity: getattr(graph, quantity).at[1, 3].set(much)})
     _, graph, _, metrics = refine(CONFIG, grid(), graph, moving((12, 0)))
     assert int(graph.verdict[1, 3]) == REACHES
     assert int(graph.verdict[0, 2]) == UNKNOWN
@@ -289,6 +294,19 @@ def test_no_region_is_cut_narrower_than_min_width(refine, moving):
         abstraction, _, _, metrics = refine(chosen, grid(), knowing((0, 2)), moving((6, 0)))
         assert int(metrics["mixed"]) == 1
         assert int(abstraction.count) == count
+
+
+@pytest.mark.parametrize(("shift", "verdict"), [(6, REACHES), (-6, MISSES)])
+def test_where_no_cut_is_possible_the_parts_where_agents_have_been_decide(refine, moving, shift, verdict):
+    # From the right part of region 0 a step of +6 leads to region 2 and one of -6 does not; nobody was in the left one.
+    chosen = settings(**{"abstraction.min_width": 6.5})
+    model = moving((shift, 0))
+    items, _ = replay.contents(model.ring)
+    x, y = items.start[:, 0], items.start[:, 1]
+    seen = items.replace(start=jnp.stack([jnp.where(x < 2, x + 6, x), y], axis=1))
+    _, graph, _, metrics = refine(chosen, grid(), knowing((0, 2)), model.replace(ring=replay.add(model.ring, seen)))
+    assert int(metrics["splits"]) == 0
+    assert int(graph.verdict[0, 2]) == verdict
 
 
 def test_an_examined_pair_may_make_several_cuts(refine, moving):
