@@ -4,7 +4,7 @@
         it was commanded `min_transitions` times since i or j last changed,
         it has no verdict, and
         the forward model's held-out error on it has stopped falling
-    the due pair that has waited longest is examined (star/reachability.py):
+    the due pair with most transitions times epochs of waiting is examined (star/reachability.py):
         all parts of i reach j:  edge i -> j, REACHES
         none does:               MISSES, for `miss_lifetime` epochs, since the low levels are still learning
         some do:                 cut i along the axis that best parts the reaching from the missing leaves
@@ -203,8 +203,8 @@ def refine(
     def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
         abstraction, graph = carry
         waiting = due(config, graph, abstraction.active)
-        share = graph.transitions / (1 + graph.transitions.max())  # of the pairs that wait as long, the most commanded
-        region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, graph.age + share, -1.0)), waiting.shape)
+        urgency = graph.transitions * (1 + graph.age)
+        region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, urgency, -1.0)), waiting.shape)
         found = waiting[region, target]
         inside = region == target
         goal_key, cut_key = jax.random.split(pair_key)
