@@ -2,7 +2,7 @@
 
     floor   a plane at z = 0, and boxes under the cells that have a floor if some have none
     walls   one box for each merged rectangle
-    block   a body on slide joints: light, 1 % smaller than its cell, with stiff contacts (BLOCK_SOLIMP)
+    block   a body on slide joints: light, 1 % smaller than its cell, with stiff contacts and limits (BLOCK_SOLIMP)
             the ant meets its box, floor and walls meet spheres in its four lower corners
     gate    a mocap body, lifted out of the way by whoever steps the model
 
@@ -36,7 +36,8 @@ BLOCK_MASS = 0.001  # kg
 BLOCK_CORNER = 0.1  # radius of its spheres, m
 BLOCK_SUNK = 1e-4  # m
 BLOCK_CLEAR = 2 * PLANE_MARGIN
-# The ant's soft contacts give way by .3 m under a bridge of 1 g, because MuJoCo scales stiffness with mass.
+# MuJoCo scales stiffness with mass: the ant's soft contacts give way by .3 m under a bridge of 1 g, and usual limits
+# by .5 m when the ant pushes it to the end of its way.
 BLOCK_SOLIMP = (0.99, 0.999, 0.001)
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 STATIC: dict[str, Any] = {"contype": 0, "conaffinity": 1}

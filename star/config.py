@@ -188,6 +188,7 @@ class TutorConfig(LevelConfig):
     enabled: bool = Field(True, description="false gives the target box to the Controller itself, as in GARA")
     period: Positive = Field(10, description="l: env steps between the Tutor's decisions")
     unroll: Positive = Field(5, description="decisions of each environment per update")
+    reward_scale: float = Field(0.3, gt=0, description="factor on the reward")
     relative_bounds: bool = Field(True, description="observe the region's bounds relative to the agent")
     off_policy_correction: bool = Field(False, description="relabel replayed subgoals (HIRO); needs learner td3")
     correction_candidates: Positive = Field(10, description="random candidates of the off-policy correction")
@@ -209,6 +210,9 @@ class TutorConfig(LevelConfig):
 class ControllerConfig(LevelConfig):
     """The Controller: drives the joints towards the subgoal."""
 
+    termination_penalty: float = Field(
+        2.0, ge=0, description="taken off the reward where the task is terminated, as by a flip"
+    )
     hindsight: bool = Field(
         False, description="replay half of the transitions with a subgoal that was reached; needs learner td3"
     )
@@ -252,18 +256,24 @@ class RefinementConfig(Section):
 
     enabled: bool = Field(True, description="false keeps the initial regions")
     within: bool = Field(True, description="examine too whether a region reaches the goals inside it")
-    min_transitions: Positive = Field(5000, description="commanded transitions before a pair is examined")
+    neighbours: bool = Field(
+        True, description="cut a region only for targets that touch it; others are reached by way of these"
+    )
+    min_transitions: Positive = Field(100, description="commanded transitions before a pair is examined")
     error_tolerance: float = Field(
-        0.1, ge=0, description="the model's error on a pair is stable once it falls by less than this share an epoch"
+        0.5, ge=0, description="the model's error on a pair is stable once it falls by less than this share an epoch"
     )
     reach_share: float = Field(0.7, gt=0, le=1, description="c1: share of the hull inside the target that reaches")
     miss_share: float = Field(0.1, ge=0, lt=1, description="tau2: share of the target covered below which a box misses")
-    depth: Annotated[int, Field(ge=1, le=8)] = Field(5, description="boxes are halved this often: 5 is 1/32")
-    min_visits: Positive = Field(100, description="visited start states a reaching box needs")
+    depth: Annotated[int, Field(ge=1, le=12)] = Field(8, description="boxes are halved this often at most: 5 is 1/32")
+    parts: Annotated[int, Field(ge=2, le=4096)] = Field(
+        32, description="parts of a region at most; those with most visits are halved first"
+    )
+    min_visits: Positive = Field(10, description="visited start states a reaching box needs")
     pairs_per_epoch: Positive = Field(16, description="pairs examined after each epoch")
     cuts: Literal["best", "random"] = Field("best", description="where a region is cut; random is for comparison")
     cuts_per_pair: Positive = Field(1, description="cuts one examined pair may make")
-    miss_lifetime: Positive = Field(10, description="epochs after which a MISSES verdict is forgotten")
+    miss_lifetime: Positive = Field(2, description="epochs after which a MISSES verdict is forgotten")
 
 
 class TrainerConfig(Section):

@@ -8,12 +8,14 @@ exact; a ReLU whose input may have either sign is relaxed as in DeepZ (Singh et 
 The box hull R of the image gives two shares (STAR, ICLR 2024, section 4.3, after AI2, Gehr et al. 2018):
 c1 = vol(R n G) / vol(R) and c2 = vol(R n G) / vol(G). With c1 >= `reach_share` the box REACHES, with
 c2 <= `miss_share` it MISSES, otherwise it is halved along the dimension of largest smear and each half is judged,
-down to 2^-depth of the start.
+down to 2^-depth of the start. Boxes that agents hardly visited are not looked into, and where there is room for few
+parts only, those with most visits are halved first: precision goes where the agents are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -46,12 +48,16 @@ class Zonotope(struct.PyTreeNode):
 
 
 class Leaves(struct.PyTreeNode):
-    """The 2^depth equal parts of an examined box, whether each was shown to reach the target, and seen enough."""
+    """The parts [P] of an examined box, whether each was shown to reach the target, and whether agents were there.
 
-    lower: Float[Array, "L d"]
-    upper: Float[Array, "L d"]
-    reaches: Bool[Array, "L"]
-    visited: Bool[Array, "L"]
+    Places not `used` hold no part: they have no volume, do not reach and were not visited.
+    """
+
+    lower: Float[Array, "P d"]
+    upper: Float[Array, "P d"]
+    reaches: Bool[Array, "P"]
+    visited: Bool[Array, "P"]
+    used: Bool[Array, "P"]
 
 
 def from_box(lower: Float[Array, "n"], upper: Float[Array, "n"]) -> Zonotope:
@@ -162,39 +168,51 @@ def examine(
     seen: Float[Array, "N"],
     *,
     depth: int,
+    parts: int,
     reach_share: float | Array,
     miss_share: float | Array,
     min_visits: int,
 ) -> Leaves:
-    """Judge `box` against `target`, halving what is undecided `depth` times.
+    """Judge `box` against `target`, halving what is undecided `depth` times, into `parts` parts at most.
 
     `network` maps an abstract state [d] to the abstract state k steps after commanding `target`. A part reaches only
     if at least `min_visits` of the start states `starts` with mask `seen` lie in it. What stays undecided does not.
     """
+    judge_all = jax.vmap(
+        lambda lower, upper: judge(*hull(network, lower, upper), target, reach_share=reach_share, miss_share=miss_share)
+    )
+    place = jnp.arange(parts)
+    inside = jnp.all((box[0] <= starts) & (starts < box[1]), axis=-1) * seen
 
-    def visited(lower: Array, upper: Array) -> Bool[Array, ""]:
-        return jnp.sum(jnp.all((lower <= starts) & (starts < upper), axis=-1) * seen) >= min_visits
+    def halve_open(carry: tuple, _: None) -> tuple[tuple, None]:
+        lower, upper, count, part, found, visits = carry
+        open_ = (found == UNKNOWN) & (visits >= min_visits) & (place < count)
+        rank = jnp.argsort(jnp.argsort(jnp.where(open_, -visits, 1.0)))  # most visits first, closed ones last
+        halved = open_ & (rank < parts - count)
+        dimension, middle = jax.vmap(partial(_halving, network))(lower, upper)
+        twin = jnp.where(halved, count + rank, parts)  # where the upper half goes
+        at_middle = halved[:, None] & (jnp.arange(lower.shape[1]) == dimension[:, None])
+        moved = halved[part] & (starts[jnp.arange(starts.shape[0]), dimension[part]] >= middle[part])
+        part = jnp.where(moved, twin[part], part)
+        lower = lower.at[twin].set(jnp.where(at_middle, middle[:, None], lower), mode="drop")
+        upper = jnp.where(at_middle, middle[:, None], upper).at[twin].set(upper, mode="drop")
+        changed = halved | jnp.zeros(parts, bool).at[twin].set(True, mode="drop")
+        found = jnp.where(changed, judge_all(lower, upper), found)
+        return (lower, upper, count + halved.sum(), part, found, _visits(part, inside, parts)), None
 
-    def verdict(lower: Array, upper: Array) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-        found = judge(*hull(network, lower, upper), target, reach_share=reach_share, miss_share=miss_share)
-        seen = visited(lower, upper)
-        return jnp.where((found == REACHES) & ~seen, MISSES, found), seen
-
-    lower, upper = box[0][None], box[1][None]
-    found, enough = jax.vmap(verdict)(lower, upper)
-    for _ in range(depth):
-        lower, upper = jax.vmap(lambda lo, hi: _halve(network, lo, hi))(lower, upper)
-        lower, upper = lower.reshape(-1, lower.shape[-1]), upper.reshape(-1, upper.shape[-1])
-        inherited, same = jnp.repeat(found, 2), jnp.repeat(enough, 2)
-        open_ = inherited == UNKNOWN
-        found, enough = jax.vmap(verdict)(lower, upper)
-        found, enough = jnp.where(open_, found, inherited), jnp.where(open_, enough, same)
-    return Leaves(lower=lower, upper=upper, reaches=found == REACHES, visited=enough)
+    empty = jnp.broadcast_to(box[1], (parts, len(box[1])))
+    lower, part = empty.at[0].set(box[0]), jnp.zeros(starts.shape[0], jnp.int32)
+    start = (lower, empty, jnp.ones((), jnp.int32), part, judge_all(lower, empty), _visits(part, inside, parts))
+    (lower, upper, count, _, found, visits), _ = jax.lax.scan(halve_open, start, None, length=depth)
+    used, enough = place < count, visits >= min_visits
+    return Leaves(
+        lower=lower, upper=upper, reaches=used & enough & (found == REACHES), visited=used & enough, used=used
+    )
 
 
 def summary(leaves: Leaves) -> Int[Array, ""]:
     """REACHES if all leaves reach, MISSES if none does, else MIXED."""
-    return _verdict(leaves.reaches, jnp.ones_like(leaves.reaches))
+    return _verdict(leaves.reaches, leaves.used)
 
 
 def summary_of_visited(leaves: Leaves) -> Int[Array, ""]:
@@ -207,10 +225,11 @@ def _verdict(reaches: Bool[Array, "L"], counted: Bool[Array, "L"]) -> Int[Array,
     return jnp.where(all_, REACHES, jnp.where(some, MIXED, MISSES))
 
 
-def _halve(network: Network, lower: Float[Array, "d"], upper: Float[Array, "d"]) -> tuple[Array, Array]:
-    """The two halves [2, d] of a box along its dimension of largest smear."""
+def _visits(part: Int[Array, "N"], counted: Float[Array, "N"], parts: int) -> Float[Array, "P"]:
+    return jnp.zeros(parts).at[part].add(counted)
+
+
+def _halving(network: Network, lower: Float[Array, "d"], upper: Float[Array, "d"]) -> tuple[Array, Array]:
+    """Where a box is halved: its dimension of largest smear, and the middle of that."""
     dimension = jnp.argmax(smear(network, lower, upper))
-    middle = (lower[dimension] + upper[dimension]) / 2
-    lowers = jnp.stack([lower, lower.at[dimension].set(middle)])
-    uppers = jnp.stack([upper.at[dimension].set(middle), upper])
-    return lowers, uppers
+    return dimension, (lower[dimension] + upper[dimension]) / 2

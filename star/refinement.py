@@ -8,7 +8,8 @@
         all parts of i reach j:  edge i -> j, REACHES
         none does:               MISSES, for `miss_lifetime` epochs, since the low levels are still learning
         some do:                 cut i along the axis that best parts the reaching from the missing leaves
-    if no cut is possible, the parts of i where agents have been decide: all of them, none, or no verdict
+    where no cut is made, since none is possible or (`neighbours`) i and j do not touch, the parts of i where agents
+    have been decide: all of them, none, or no verdict
 
 With `within`, pairs (i, i) are examined too: does a region reach the goals inside it? They count decisions of agents
 in i whose goal lies in i. One of their goals is drawn, if possible one that was reached, and the square inside its
@@ -138,9 +139,13 @@ def best_cut(
 
     The gain is the decrease of Gini impurity, as in a decision tree: the impurity of a part with volume v, of which r
     reaches, is r (v - r) / v; it is given as a share of the volume of all leaves. Cuts lie on leaf boundaries and
-    leave both parts at least `min_width` wide. With `key` one of these cuts is drawn at random instead.
+    leave both parts at least `min_width` wide. With `key` a cut is drawn at random instead, anywhere in the leaves.
     """
-    positions = leaves.upper.T
+    positions = leaves.upper.T  # those of places not in use lie on the faces of the box, where nothing can be cut
+    if key is not None:
+        position_key, key = jax.random.split(key)
+        low, high = leaves.lower.min(axis=0), leaves.upper.max(axis=0)
+        positions = jax.random.uniform(position_key, positions.shape, minval=low[:, None], maxval=high[:, None])
     volume = jnp.prod(leaves.upper - leaves.lower, axis=-1)
 
     def overlap(lower: Array, upper: Array) -> Float[Array, "L"]:
@@ -158,8 +163,7 @@ def best_cut(
         whole = overlap(lower, upper)
         decrease = impurity(whole) - impurity(below) - impurity(whole - below)
         if key is not None:
-            inside = (below.sum() > 0) & (below.sum() < whole.sum())
-            decrease = inside * volume.sum()
+            decrease = volume.sum()
         return jnp.where(wide & candidates[region], decrease / volume.sum(), 0.0)
 
     d, count = positions.shape
@@ -225,8 +229,10 @@ def refine(
             ),
         )
         mixed = judged & (verdict == MIXED)
+        if config.refinement.neighbours:
+            mixed &= inside | regions.adjacent(abstraction)[region, target]
         abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed, key=cut_key)
-        verdict = jnp.where(mixed & ~splits.done.any(), reachability.summary_of_visited(leaves), verdict)
+        verdict = jnp.where((verdict == MIXED) & ~splits.done.any(), reachability.summary_of_visited(leaves), verdict)
         settled = judged & ~inside & ((verdict == REACHES) | (verdict == MISSES))
         known = jnp.where(settled, verdict, graph.verdict[region, target])
         graph = graph.replace(verdict=graph.verdict.at[region, target].set(known))
@@ -295,6 +301,7 @@ def _examine(
         starts,
         seen,
         depth=config.refinement.depth,
+        parts=config.refinement.parts,
         reach_share=config.refinement.reach_share,
         miss_share=config.refinement.miss_share,
         min_visits=config.refinement.min_visits,

@@ -105,7 +105,7 @@ def test_a_wrong_type_names_key_value_and_what_is_allowed(write, text, key, valu
         ("commander: {discount: 1}", "commander.discount: 1", "less than 1"),
         ("commander: {epsilon_end: 1.1}", "commander.epsilon_end: 1.1", "less than or equal to 1"),
         ("abstraction: {max_regions: 5000}", "abstraction.max_regions: 5000", "less than or equal to 1024"),
-        ("refinement: {depth: 9}", "refinement.depth: 9", "less than or equal to 8"),
+        ("refinement: {depth: 13}", "refinement.depth: 13", "less than or equal to 12"),
         ("tutor: {learner: sac}", "tutor.learner: 'sac'", "'ppo' or 'td3'"),
         ("commander: {successors: some}", "commander.successors: 'some'", "'all', 'any', 'possible' or 'known'"),
     ],

@@ -75,8 +75,9 @@ def test_the_controller_is_paid_for_the_distance_to_its_moving_subgoal(recording
             g = recording.steps.subgoal[i, t, b]
             s, after = recording.steps.obs[i, t, b, :2], recording.steps.next_obs[i, t, b, :2]
             left = np.linalg.norm(s + g - after)
-            expected = -left if recording.published else np.linalg.norm(g) - left
-            np.testing.assert_allclose(recording.controller.reward[i, t, b], 0.5 * expected, atol=1e-5)
+            expected = 0.5 * (-left if recording.published else np.linalg.norm(g) - left)
+            expected -= recording.config.controller.termination_penalty * recording.steps.terminated[i, t, b]
+            np.testing.assert_allclose(recording.controller.reward[i, t, b], expected, atol=1e-5)
 
 
 def test_the_controller_sees_no_position_but_the_subgoal_before_and_after_the_step(recording):
@@ -353,12 +354,16 @@ def test_hindsight_makes_what_was_reached_the_subgoal_of_half_of_the_batch(break
     np.testing.assert_allclose(np.asarray(got.reward)[changed], expected[changed], atol=1e-5)
 
 
-def test_a_termination_costs_its_penalty(breaking_env, tiny, recording):
-    prices = {"controller.termination_penalty": 3.0, "tutor.termination_penalty": 5.0}
-    dear, free = (config.parse(recording.config.model_dump(), values).agent() for values in (prices, {}))
+def test_a_termination_costs_its_penalty(recording):
     steps = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.steps)
-    paid = hierarchy._controller_rollout(free, recording.spec, steps).reward
-    less = hierarchy._controller_rollout(dear, recording.spec, steps).reward
+    paid, less = (
+        hierarchy._controller_rollout(
+            config.parse(recording.config.model_dump(), {"controller.termination_penalty": price}).agent(),
+            recording.spec,
+            steps,
+        ).reward
+        for price in (0.0, 3.0)
+    )
     np.testing.assert_allclose(paid - less, 3.0 * steps.terminated, atol=1e-5)
     assert steps.terminated.any()
 

@@ -36,6 +36,7 @@ def examine():
             starts,
             seen,
             depth=DEPTH,
+            parts=2**DEPTH,
             reach_share=reach_share,
             miss_share=miss_share,
             min_visits=min_visits,
@@ -103,7 +104,7 @@ def test_smear_of_a_linear_map_is_exact():
 
 def test_an_unknown_part_is_halved_along_its_largest_smear():
     steep = Network(layers=(f32(np.diag([1.0, 10.0]), np.zeros(2)),))
-    run = jax.jit(partial(reachability.examine, depth=1, reach_share=0.7, miss_share=0.1, min_visits=0))
+    run = jax.jit(partial(reachability.examine, depth=1, parts=2, reach_share=0.7, miss_share=0.1, min_visits=0))
     nobody = f32(np.zeros((1, 2)), np.ones(1))
     leaves = run(steep, f32((0, 0), (4, 2)), f32((0, 0), (4, 10)), *nobody)
     np.testing.assert_allclose(leaves.lower, [[0, 0], [0, 1]])
@@ -111,13 +112,19 @@ def test_an_unknown_part_is_halved_along_its_largest_smear():
     assert leaves.reaches.tolist() == [True, False]
 
 
+def used(leaves):
+    """Lower and upper corners and whether they reach, of the parts in use."""
+    return tuple(
+        np.asarray(x, np.float64)[np.asarray(leaves.used)] for x in (leaves.lower, leaves.upper, leaves.reaches)
+    )
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_leaves_tile_the_box_exactly(examine, seed):
     rng = np.random.default_rng(seed)
     box = (np.array([-1.0, 2.0]), np.array([-1.0, 2.0]) + 2.0 ** rng.integers(-2, 3, 2))
-    leaves = examine(box, (rng.normal(size=2), 5 + rng.random(2)))
-    lower, upper = np.float64(leaves.lower), np.float64(leaves.upper)
-    assert len(lower) == 2**DEPTH
+    lower, upper, _ = used(examine(box, (rng.normal(size=2), 5 + rng.random(2))))
+    assert 1 <= len(lower) <= 2**DEPTH
     assert (lower >= box[0]).all() and (upper <= box[1]).all()
     overlap = (np.maximum(lower[:, None], lower) < np.minimum(upper[:, None], upper)).all(-1)
     np.testing.assert_array_equal(overlap, np.eye(len(lower), dtype=bool))
@@ -125,17 +132,42 @@ def test_leaves_tile_the_box_exactly(examine, seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_leaf_reaches_where_all_of_it_is_carried_into_the_target(examine, seed):
+def test_leaves_are_those_of_a_plain_recursion(examine, seed):
     rng = np.random.default_rng(seed)
     by = rng.integers(-12, 13, 2) / 4
-    box = (np.zeros(2), np.array([4.0, 8.0]))
     lower = rng.integers(-16, 20, 2) / 4
     target = (lower, lower + rng.integers(8, 28, 2) / 4)
-    leaves = examine(box, target, by=by)
-    for low, high, reaches in zip(*map(np.asarray, (leaves.lower, leaves.upper, leaves.reaches)), strict=True):
-        image = by + rng.uniform(low, high, (4000, 2))
-        inside = ((target[0] <= image) & (image <= target[1])).all(-1)
-        assert reaches == inside.all()
+    starts = rng.uniform(0, (4, 8), (64, 2))
+    found = used(
+        examine((np.zeros(2), np.array([4.0, 8.0])), target, by=by, starts=starts, min_visits=3, miss_share=1e-4)
+    )
+
+    def recurse(low, high, depth):
+        visits = ((low <= np.float32(starts)) & (np.float32(starts) < high)).all(-1).sum()
+        overlap = np.prod(np.maximum(np.minimum(high + by, target[1]) - np.maximum(low + by, target[0]), 0))
+        if overlap >= 0.999 * np.prod(high - low):
+            return [(*low, *high, visits >= 3)]
+        if overlap == 0 or depth == 0 or visits < 3:
+            return [(*low, *high, False)]
+        axis = np.argmax(high - low)
+        middle = np.where(np.arange(2) == axis, (low + high) / 2, high)
+        return recurse(low, middle, depth - 1) + recurse(np.where(middle < high, middle, low), high, depth - 1)
+
+    assert sorted(recurse(np.zeros(2), np.array([4.0, 8.0]), DEPTH)) == sorted(
+        (*low, *high, bool(r)) for low, high, r in zip(*found, strict=True)
+    )
+
+
+def test_where_room_is_scarce_the_parts_with_most_visits_are_halved():
+    narrow = displaced(*f32(np.zeros(1)))
+    starts, seen = f32(np.array([[0.1]] * 5 + [[6.5]] * 9 + [[6.9]]), np.ones(15))
+    leaves = reachability.examine(
+        narrow, f32([0.0], [8.0]), f32([6.25], [8.0]), starts, seen,
+        depth=4, parts=4, reach_share=0.999, miss_share=0.0, min_visits=1,
+    )  # fmt: skip
+    lower, upper, reaches = used(leaves)
+    parts = sorted(zip(lower[:, 0], upper[:, 0], reaches, strict=True))
+    assert parts == [(0, 4, False), (4, 6, False), (6, 7, False), (7, 8, False)]  # (7, 8) has no visits
 
 
 def test_parts_that_stay_undecided_do_not_reach(examine):
@@ -144,7 +176,7 @@ def test_parts_that_stay_undecided_do_not_reach(examine):
     leaves = examine(box, target, reach_share=0.7, miss_share=1e-6)
     assert not leaves.reaches.any()
     assert int(reachability.summary(leaves)) == MISSES
-    assert bool(examine(box, target, reach_share=0.4, miss_share=1e-6).reaches.all())
+    assert used(examine(box, target, reach_share=0.4, miss_share=1e-6))[2].all()
 
 
 @pytest.mark.parametrize(("visits", "reaches"), [(9, False), (10, True)])
@@ -153,7 +185,7 @@ def test_a_part_reaches_only_with_enough_visited_starts(examine, visits, reaches
     starts[:visits] = 1.0
     starts[40:], seen[40:] = 1.0, 0.0  # slots of the buffer that hold nothing
     leaves = examine(((0, 0), (4, 4)), ((-9, -9), (9, 9)), starts=starts, seen=seen, min_visits=10)
-    assert leaves.reaches.tolist() == [reaches] * 2**DEPTH
+    assert used(leaves)[2].tolist() == [reaches]
 
 
 def test_starts_count_for_the_part_they_lie_in(examine):
@@ -163,8 +195,10 @@ def test_starts_count_for_the_part_they_lie_in(examine):
     assert not examine(box, target, starts=starts, min_visits=5).reaches.any()
     starts[:5, 0] = 2.0  # a start on the cut belongs to the upper half
     leaves = examine(box, target, starts=starts, min_visits=5)
-    np.testing.assert_array_equal(leaves.reaches, np.asarray(leaves.lower)[:, 0] >= 2)
-    assert leaves.visited[np.asarray(leaves.lower)[:, 0] >= 2].all() and not leaves.visited.all()
+    right = np.asarray(leaves.used & (leaves.lower[:, 0] >= 2))
+    assert right.any()
+    np.testing.assert_array_equal(leaves.reaches, right)
+    assert leaves.visited[right].all()
 
 
 @pytest.mark.parametrize(
@@ -189,5 +223,6 @@ def test_summary_of_the_leaves_where_agents_have_been(reaches, visited, verdict)
 
 
 def leaves_of(reaches, visited):
-    corners = jnp.zeros((len(reaches), 1))
-    return Leaves(lower=corners, upper=corners, reaches=jnp.array(reaches), visited=jnp.array(visited))
+    corners = jnp.zeros((len(reaches) + 1, 1))
+    masks = (jnp.array([*mask, False]) for mask in (reaches, visited, [True] * len(reaches)))  # one place not in use
+    return Leaves(corners, corners, *masks)

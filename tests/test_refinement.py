@@ -191,7 +191,8 @@ def test_the_best_cut_is_that_of_a_brute_force_gini_search(best_cut, seed):
             for position in np.unique(upper[:, dimension]):
                 if low[dimension] + 2 <= position <= high[dimension] - 2:
                     best = max(best, slow_gain(low, high, leaves, dimension, position))
-    given = Leaves(jnp.float32(lower), jnp.float32(upper), jnp.asarray(reaches), jnp.ones(len(reaches), bool))
+    everywhere = jnp.ones(len(reaches), bool)
+    given = Leaves(jnp.float32(lower), jnp.float32(upper), jnp.asarray(reaches), everywhere, everywhere)
     cut, gain = best_cut(abstraction, jnp.isin(jnp.arange(R), jnp.array(candidates)), given, 2.0)
     np.testing.assert_allclose(gain, best, rtol=1e-4, atol=1e-6)
     assert best > 0 and int(cut.region) in candidates
@@ -249,13 +250,11 @@ def test_the_parts_get_verdicts_and_a_miss_is_examined_again_after_its_lifetime(
     ]
 
 
-@pytest.mark.parametrize(("quantity", "much"), [("transitions", 500.0), ("age", 1)])
-def test_the_pair_that_has_waited_longest_is_examined_first_of_equals_the_one_commanded_most(
-    refine, moving, quantity, much
-):
+@pytest.mark.parametrize(("quantity", "much"), [("transitions", 500.0), ("age", 5)])
+def test_first_comes_the_pair_commanded_most_or_that_has_waited_longest(refine, moving, quantity, much):
     graph = knowing((0, 2), (1, 3))
     if quantity == "age":  # although the other one was commanded more often
-        graph = graph.replace(transitions=graph.transitions.at[0, 2].set(500.0))
+        graph = graph.replace(transitions=graph.transitions.at[0, 2].set(200.0))
     graph = graph.replace(**{quantity: getattr(graph, quantity).at[1, 3].set(much)})
     _, graph, _, metrics = refine(CONFIG, grid(), graph, moving((12, 0)))
     assert int(graph.verdict[1, 3]) == REACHES
@@ -309,9 +308,16 @@ def test_where_no_cut_is_possible_the_parts_where_agents_have_been_decide(refine
     assert int(graph.verdict[0, 2]) == verdict
 
 
+@pytest.mark.parametrize(("target", "by", "cuts"), [(2, (6, 0), 1), (3, (6, 6), 0)])
+def test_only_targets_that_touch_a_region_cut_it_if_told_so(refine, moving, target, by, cuts):
+    _, graph, _, metrics = refine(CONFIG, grid(), knowing((0, target)), moving(by))  # regions 0 and 3 share a corner
+    assert int(metrics["splits"]) == cuts
+    assert int(graph.verdict[0, target]) == UNKNOWN  # agents have been all over the region, and only a part reaches
+
+
 def test_an_examined_pair_may_make_several_cuts(refine, moving):
     # +6 along both axes: only the upper right quarter of region 0 reaches region 3, which takes two cuts to part.
-    chosen = settings(**{"refinement.cuts_per_pair": 2})
+    chosen = settings(**{"refinement.cuts_per_pair": 2, "refinement.neighbours": False})
     abstraction, _, splits, _ = refine(chosen, grid(), knowing((0, 3)), moving((6, 6)))
     assert splits.done.tolist() == [True, True]
     corners = np.concatenate([abstraction.lower, abstraction.upper], axis=1)

@@ -75,6 +75,15 @@ def test_a_pushed_block_falls_into_the_gap_and_bears_the_ant_to_the_goal():
     assert fall.seen[-1] == 1.0
 
 
+def test_a_block_that_is_pushed_on_at_the_end_of_its_way_stays_there_and_falls():
+    fall = Scripted("ant_fall", engine="native")
+    fall.go(8.0, 0.0)
+    way = []
+    fall.go(8.0, 12.5, until=lambda: way.append(fall.block) or fall.block[1] < -0.5)
+    assert 7.9 < max(y for y, _ in way) < 8.05
+    assert way[-1][1] < -0.5
+
+
 def test_who_steps_into_the_gap_stays_there_and_never_succeeds():
     fall = Scripted("ant_fall", engine="native")
     fall.go(0.0, 16.0, steps=80)
