@@ -7,8 +7,9 @@ over it; by default all agents. SETTINGS are passed on to `star train`. For each
 in one program, or with --one-by-one one after another, which is how wall-clock times to a success are meant to be
 taken. Into the folder go
 
-    NAME.json     every seed's success on `--episodes` greedy episodes on test goals, env steps and training seconds,
-                  compilation included, to success_any .9 (null: never), the command, commit, device and versions
+    NAME.json     every seed's success on `--episodes` greedy episodes on test goals; env steps to success_any .9 (null:
+                  never), seconds of training to it, and seconds since the start of the run, with compilation and
+                  evaluations; the command, commit, device and versions
     curves.jsonl  all evaluations during training
     curves.png    success_any over env steps and over wall-clock: mean over seeds and their range
     table.md      means over seeds and interquartile means with 95 % bootstrap intervals
@@ -73,33 +74,37 @@ def measure(task: str, name: str, options: argparse.Namespace, settings: list[st
         evaluated += json.loads(report.splitlines()[-1])["seeds"]
     keys = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
     curve = [{"name": name} | {k: row[k] for k in keys if k in row} for row in rows if "eval/success_any" in row]
+    speed = float(np.median([row["env_steps_per_s"] for row in rows]))  # of the seeds of a program together
     for seed in evaluated:
         first = next((p for p in curve if p["seed"] == seed["seed"] and p["eval/success_any"] >= LEVEL), None)
-        seed |= {"env_steps_to_level": first and first["env_steps"], "seconds_to_level": first and first["wall_s"]}
-    speeds = [row["env_steps_per_s"] for row in rows]
+        seed |= {
+            "env_steps_to_level": first and first["env_steps"],
+            "training_seconds_to_level": first and round(first["env_steps"] * len(groups[0]) / speed, 1),
+            "seconds_to_level": first and first["wall_s"],
+        }
     return {
         "task": task,
         "name": name,
         "seeds": evaluated,
         "one_by_one": options.one_by_one,
         "env_steps_per_seed": max(row["env_steps"] for row in rows),
-        "env_steps_per_s": float(np.median(speeds)),
+        "env_steps_per_s": speed,
         "commands": commands,
-        **provenance(),
+        **provenance(options.commit),
     }, curve
 
 
-def provenance() -> dict[str, Any]:
-    """Commit, device and versions."""
+def provenance(commit: str | None) -> dict[str, Any]:
+    """Commit (if not given that of this checkout, with a + if it was changed), device and versions."""
     git = ["git", "-C", str(ROOT)]
-    commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
-    changed = bool(
-        subprocess.run([*git, "status", "--porcelain", "star", "envs", "configs"], capture_output=True).stdout
-    )
+    if commit is None:
+        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+        changes = [*git, "status", "--porcelain", "star", "envs", "configs"]
+        commit += "+" * bool(subprocess.run(changes, capture_output=True).stdout)
     device = subprocess.run([sys.executable, "-c", _DEVICE], capture_output=True, text=True).stdout.strip()
     names = ("jax", "mujoco", "mujoco-mjx", "brax")
     return {
-        "commit": commit + "+" * changed,
+        "commit": commit,
         "device": device,
         "python": platform.python_version(),
         "versions": {name: metadata.version(name) for name in names},
@@ -125,8 +130,8 @@ def table(reports: list[dict[str, Any]]) -> str:
     """A Markdown table of the agents."""
     lines = [
         "| agent | seeds | env steps per seed | success_any | success_final | interquartile mean of success_final "
-        f"| median env steps to success_any {LEVEL:g} | median seconds to it |",
-        "|---|---|---|---|---|---|---|---|",
+        f"| median env steps to success_any {LEVEL:g} | seconds of training to it | seconds since the start |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for report in reports:
         seeds = report["seeds"]
@@ -139,9 +144,10 @@ def table(reports: list[dict[str, Any]]) -> str:
             cells.append("{:.2f} [{:.2f}, {:.2f}]".format(*interval([seed[key] for seed in seeds], statistic)))
         for key, form in (
             ("env_steps_to_level", lambda x: f"{x / 1e6:.1f} M"),
+            ("training_seconds_to_level", "{:.0f} s".format),
             ("seconds_to_level", "{:.0f} s".format),
         ):
-            middle = float(np.median([np.inf if seed[key] is None else seed[key] for seed in seeds]))
+            middle = float(np.median([np.inf if seed.get(key) is None else seed[key] for seed in seeds]))
             cells.append(form(middle) if np.isfinite(middle) else "never")
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
@@ -181,6 +187,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--one-by-one", action="store_true")
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--commit", help="what to record where there is no git")
     parser.add_argument("--runs", type=Path, default=Path("runs/reproduce"))
     given = sys.argv[1:] if arguments is None else arguments
     end = given.index("--") if "--" in given else len(given)

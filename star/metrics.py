@@ -6,6 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,7 +15,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 
 class JsonLines:
-    """`metrics.jsonl`: one object a line and seed, flushed at once."""
+    """A file with one object a line, flushed at once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -34,11 +35,26 @@ class JsonLines:
 
     def keep_until(self, env_steps: int) -> list[dict[str, Any]]:
         """Drop what was written after `env_steps`, for a run that goes on from there; returns what stays."""
+        if not self.path.exists():
+            return []
         rows = [row for row in self.read() if row["env_steps"] <= env_steps]
         partial = self.path.with_suffix(".partial")
         partial.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
         os.replace(partial, self.path)
         return rows
+
+
+@dataclass(frozen=True)
+class Journal:
+    """What a run writes down: `metrics.jsonl`, a line for each epoch and seed, and `regions.jsonl`, for evaluations."""
+
+    metrics: JsonLines
+    regions: JsonLines
+
+    @classmethod
+    def of(cls, run_dir: Path) -> Journal:
+        """That of a run directory."""
+        return cls(JsonLines(run_dir / "metrics.jsonl"), JsonLines(run_dir / "regions.jsonl"))
 
 
 class Display:

@@ -1,4 +1,4 @@
-"""Figures of a run: the regions over the maze beside the success curve."""
+"""Figures of a run: the regions over the maze, as they are and as they grew, and the success curve."""
 
 from __future__ import annotations
 
@@ -16,36 +16,64 @@ from matplotlib.patches import Rectangle
 from star.state import TrainState
 
 _MAX_PANELS = 5
+_GROWTH_PANELS = 4
+
+Row = Mapping[str, Any]
 
 
-def summary_figure(
-    path: Path, *, state: TrainState, rows: Sequence[Mapping[str, Any]], walls: np.ndarray, seeds: Sequence[int]
-) -> None:
-    """Draw the abstraction of each seed (leading axis of `state`, first five) and success over env steps.
+def region_rows(state: TrainState, seeds: Sequence[int], *, env_steps: int) -> list[Row]:
+    """The abstraction of every seed (leading axis of `state`) as plain values, a row of `regions.jsonl` each.
+
+    `lower` and `upper` are the corners of the regions in use, `chosen` how often the Commander chose each of late.
+    """
+    tables = state.abstraction.lower, state.abstraction.upper, state.commander.chosen
+    lower, upper, chosen, count = (np.asarray(table) for table in (*tables, state.abstraction.count))
+
+    def of(table: np.ndarray, index: int) -> list[Any]:
+        return np.round(table[index, : count[index]].astype(float), 4).tolist()
+
+    return [
+        {"seed": seed, "env_steps": env_steps, "lower": of(lower, i), "upper": of(upper, i), "chosen": of(chosen, i)}
+        for i, seed in enumerate(seeds)
+    ]
+
+
+def summary_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], walls: np.ndarray) -> None:
+    """Draw the last abstraction of each of the first five seeds in `regions`, and the success in `rows`.
 
     `walls` [n, 4] are rectangles (x_low, y_low, x_high, y_high). Regions are coloured by how often the Commander
     chose them of late.
     """
-    shown = list(seeds)[:_MAX_PANELS]
+    last = {row["seed"]: row for row in regions}
+    shown = list(last.values())[:_MAX_PANELS]
     figure = Figure(figsize=(4.6 * (len(shown) + 1), 4.4), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, len(shown) + 1))
-    for panel, (axis, seed) in enumerate(zip(axes[:-1], shown, strict=True)):
-        draw_regions(axis, state, panel, walls)
-        axis.set_title(f"regions, seed {seed}")
-    share = ScalarMappable(norm=Normalize(0, 1), cmap="viridis")
-    figure.colorbar(share, ax=list(axes[:-1]), label="chosen by the Commander (relative to the most chosen)")
+    axes = list(np.atleast_1d(figure.subplots(1, len(shown) + 1)))
+    _draw_panels(axes[:-1], [(row, f"regions, seed {row['seed']}") for row in shown], walls)
     draw_success(axes[-1], rows)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150)
+    _save(figure, path)
 
 
-def draw_regions(axis: Axes, state: TrainState, index: int, walls: np.ndarray) -> None:
-    """The first two abstract dimensions of the regions of seed number `index`, over the walls."""
-    count = int(state.abstraction.count[index])
-    lower = np.asarray(state.abstraction.lower[index][:count])
-    upper = np.asarray(state.abstraction.upper[index][:count])
-    chosen = np.asarray(state.commander.chosen[index][:count])
-    space = np.asarray(state.abstraction.space[index])
+def growth_figure(
+    path: Path, *, regions: Sequence[Row], walls: np.ndarray, moments: Sequence[float] | None = None
+) -> None:
+    """Draw the abstraction of the first seed in `regions` at `moments` (env steps), by default quarters of the run.
+
+    Each moment shows the first row at or after it, or the last one.
+    """
+    rows = [row for row in regions if row["seed"] == regions[0]["seed"]]
+    if moments is None:
+        moments = [rows[-1]["env_steps"] * (i + 1) / _GROWTH_PANELS for i in range(_GROWTH_PANELS)]
+    shown = [next((row for row in rows if row["env_steps"] >= moment), rows[-1]) for moment in moments]
+    figure = Figure(figsize=(4.6 * len(shown), 4.4), layout="constrained")
+    axes = list(np.atleast_1d(figure.subplots(1, len(shown))))
+    titles = [f"{len(row['chosen'])} regions at {row['env_steps'] / 1e6:.3g} M env steps" for row in shown]
+    _draw_panels(axes, list(zip(shown, titles, strict=True)), walls)
+    _save(figure, path)
+
+
+def draw_regions(axis: Axes, row: Row, walls: np.ndarray) -> None:
+    """The first two abstract dimensions of the regions of a row, over the walls."""
+    lower, upper, chosen = (np.asarray(row[key], float) for key in ("lower", "upper", "chosen"))
     colours = ScalarMappable(norm=Normalize(0, max(float(chosen.max()), 1e-9)), cmap="viridis").to_rgba(chosen)
     for low, high, colour in zip(lower, upper, colours, strict=True):
         width, height = (high - low)[:2]
@@ -54,14 +82,14 @@ def draw_regions(axis: Axes, state: TrainState, index: int, walls: np.ndarray) -
         axis.add_patch(
             Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, facecolor="0.25", alpha=0.75, linewidth=0)
         )
-    axis.set_xlim(space[0, 0], space[1, 0])
-    axis.set_ylim(space[0, 1], space[1, 1])
+    axis.set_xlim(lower[:, 0].min(), upper[:, 0].max())
+    axis.set_ylim(lower[:, 1].min(), upper[:, 1].max())
     axis.set_aspect("equal")
     axis.set_xlabel("x")
     axis.set_ylabel("y")
 
 
-def draw_success(axis: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+def draw_success(axis: Axes, rows: Sequence[Row]) -> None:
     """Both success measures over env steps, mean over seeds, with the range between seeds."""
     for name, style in (("success_any", "--"), ("success_final", "-")):
         key = f"eval/{name}"
@@ -78,3 +106,19 @@ def draw_success(axis: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
     axis.set_ylim(-0.02, 1.02)
     axis.grid(alpha=0.3)
     axis.legend(loc="lower right")
+
+
+def _draw_panels(axes: Sequence[Axes], panels: Sequence[tuple[Row, str]], walls: np.ndarray) -> None:
+    """One abstraction for each of `axes`, with its title, and the scale of their colours."""
+    for axis, (row, title) in zip(axes, panels, strict=True):
+        draw_regions(axis, row, walls)
+        axis.set_title(title)
+    if panels:
+        share = ScalarMappable(norm=Normalize(0, 1), cmap="viridis")
+        label = "chosen by the Commander (relative to the most chosen)"
+        axes[0].figure.colorbar(share, ax=list(axes), label=label)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)

@@ -24,7 +24,7 @@ from star import state as states
 from star.checkpoint import Checkpoints, check_compatible
 from star.config import Config, ConfigError, parse
 from star.episode import Episode
-from star.metrics import Display, JsonLines, mean
+from star.metrics import Display, Journal, mean
 from star.state import Spec, TrainState
 
 # Streams of random keys that no seed of training uses.
@@ -109,14 +109,14 @@ def train(
     console = console or Console(stderr=True)
     program = build(config)
     checkpoints = Checkpoints(run_dir, keep=config.trainer.keep_checkpoints)
-    sink = JsonLines(run_dir / "metrics.jsonl")
+    journal = Journal.of(run_dir)
     if resume:
-        state, rows = _restore(program, checkpoints, sink)
+        state = _restore(program, checkpoints, journal)
     else:
         _prepare(run_dir, program.config)
-        state, rows = program.init(seed_keys(program)), []
+        state = program.init(seed_keys(program))
     try:
-        return _loop(program, state, rows, run_dir, checkpoints, sink, quiet=quiet, console=console)
+        return _loop(program, state, run_dir, checkpoints, journal, quiet=quiet, console=console)
     finally:
         checkpoints.close()
 
@@ -174,15 +174,15 @@ def select_device(device: str) -> None:
 def _loop(
     program: Program,
     state: TrainState,
-    rows: list[dict[str, Any]],
     run_dir: Path,
     checkpoints: Checkpoints,
-    sink: JsonLines,
+    journal: Journal,
     *,
     quiet: bool,
     console: Console,
 ) -> Result:
     config, seeds = program.config.trainer, program.seeds
+    rows, regions = journal.metrics.read(), journal.regions.read()
     done = int(state.epoch[0])
     began = time.monotonic() - (rows[-1]["wall_s"] if rows else 0.0)
     success = _latest_success(rows)
@@ -200,14 +200,18 @@ def _loop(
             table = _rows(metrics, seeds)
             speed = program.env_steps_per_epoch * len(seeds) / (time.monotonic() - epoch_began)
             done += 1
+            env_steps = done * program.env_steps_per_epoch
             if done % config.eval_every == 0 or done == program.epochs:
                 _add_evaluation(table, program.evaluate(state, evaluation_keys(program, done)))
                 success = mean(table, "eval/success_final")
-            env_steps = done * program.env_steps_per_epoch
+                if program.config.commander.enabled:
+                    for region_row in report.region_rows(state, seeds, env_steps=env_steps):
+                        journal.regions.write(region_row)
+                        regions.append(dict(region_row))
             for row in table:
                 row |= {"env_steps": env_steps, "wall_s": round(time.monotonic() - began, 3)}
                 row |= {"env_steps_per_s": round(speed)}
-                sink.write(row)
+                journal.metrics.write(row)
             rows.extend(table)
             display.update(env_steps, table, left_s=(program.epochs - done) * (time.monotonic() - epoch_began))
             if done % config.checkpoint_every == 0 or done == program.epochs:
@@ -216,7 +220,9 @@ def _loop(
         stopped = done < program.epochs
         if saved != done:
             checkpoints.save(done * program.env_steps_per_epoch, state, program.config, success=_or_zero(success))
-    report.summary_figure(run_dir / "figures" / "summary.png", state=state, rows=rows, walls=program.walls, seeds=seeds)
+    report.summary_figure(run_dir / "figures" / "summary.png", regions=regions, rows=rows, walls=program.walls)
+    if regions:
+        report.growth_figure(run_dir / "figures" / "growth.png", regions=regions, walls=program.walls)
     return Result(run_dir, done * program.env_steps_per_epoch, stopped, success)
 
 
@@ -242,13 +248,15 @@ def _or_zero(success: float | None) -> float:
     return 0.0 if success is None else success
 
 
-def _restore(program: Program, checkpoints: Checkpoints, sink: JsonLines) -> tuple[TrainState, list[dict[str, Any]]]:
-    steps = checkpoints.steps()
+def _restore(program: Program, checkpoints: Checkpoints, journal: Journal) -> TrainState:
+    steps, run_dir = checkpoints.steps(), journal.metrics.path.parent
     if not steps:
-        raise ConfigError(f"{sink.path.parent}: holds no checkpoint to resume from")
-    check_compatible(checkpoints.config(steps[-1]), program.config, source=sink.path.parent)
-    example = jax.eval_shape(program.init, seed_keys(program))
-    return checkpoints.restore(steps[-1], example), sink.keep_until(steps[-1])
+        raise ConfigError(f"{run_dir}: holds no checkpoint to resume from")
+    check_compatible(checkpoints.config(steps[-1]), program.config, source=run_dir)
+    state = checkpoints.restore(steps[-1], jax.eval_shape(program.init, seed_keys(program)))
+    for lines in (journal.metrics, journal.regions):
+        lines.keep_until(steps[-1])
+    return state
 
 
 def _choose(checkpoints: Checkpoints, run_dir: Path, wanted: str) -> int:

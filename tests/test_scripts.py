@@ -56,7 +56,14 @@ def test_the_benchmark_measures_both_loops():
 
 def report(name, finals, *, to_level):
     seeds = [
-        {"seed": i, "success_any": 1.0, "success_final": final, "env_steps_to_level": steps, "seconds_to_level": steps}
+        {
+            "seed": i,
+            "success_any": 1.0,
+            "success_final": final,
+            "env_steps_to_level": steps,
+            "training_seconds_to_level": steps and steps / 1e6,
+            "seconds_to_level": steps and steps / 1e5,
+        }
         for i, (final, steps) in enumerate(zip(finals, to_level, strict=True))
     ]
     return {"name": name, "seeds": seeds, "env_steps_per_seed": 2_500_000}
@@ -73,6 +80,7 @@ def test_the_table_tells_means_over_seeds_with_intervals_and_who_never_got_there
     star, flat = (line.split(" | ") for line in text.splitlines()[2:])
     assert star[1:4] == ["5", "2.5 M", "1.00 [1.00, 1.00]"]
     assert star[4].startswith("0.80 [") and star[5].startswith("1.00 [") and star[6] == "3.0 M"
+    assert star[7:] == ["3 s", "30 s |"]
     assert flat[4] == "0.00 [0.00, 0.00]" and flat[6] == "never"
     low, high = (float(x) for x in star[4][6:-1].split(","))
     assert low < 0.8 < high <= 1

@@ -19,7 +19,7 @@ import yaml
 from star import cli, trainer
 from star.checkpoint import Checkpoints
 from star.config import ConfigError, load, parse
-from star.metrics import JsonLines
+from star.metrics import Journal, JsonLines
 
 ROOT = Path(__file__).parents[1]
 TIMES = ("wall_s", "env_steps_per_s")
@@ -88,8 +88,11 @@ def finished(tmp_path_factory):
 def test_a_run_leaves_config_metrics_checkpoints_and_figure(finished):
     run_dir, result = finished
     assert result.env_steps == 4 * EPOCH and not result.interrupted
-    assert {entry.name for entry in run_dir.iterdir()} == {"config.yaml", "metrics.jsonl", "checkpoints", "figures"}
-    assert (run_dir / "figures" / "summary.png").read_bytes().startswith(b"\x89PNG")
+    assert {entry.name for entry in run_dir.iterdir()} == {
+        "config.yaml", "metrics.jsonl", "regions.jsonl", "checkpoints", "figures",
+    }  # fmt: skip
+    for name in ("summary", "growth"):
+        assert (run_dir / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     assert Checkpoints(run_dir).steps() == [2 * EPOCH, 4 * EPOCH]
 
 
@@ -105,6 +108,17 @@ def test_metrics_have_a_line_for_each_epoch_and_seed(finished):
     assert [(row["env_steps"], row["seed"]) for row in table] == [(n * EPOCH, s) for n in (1, 2, 3, 4) for s in (0, 1)]
     assert all("train/success_any" in row and "abstraction/regions" in row for row in table)
     assert [row["env_steps"] // EPOCH for row in table if "eval/success_final" in row] == [2, 2, 4, 4]
+
+
+def test_regions_have_a_line_for_each_evaluation_and_seed_and_cover_the_space(finished):
+    run_dir, _ = finished
+    table, metrics = Journal.of(run_dir).regions.read(), rows(run_dir)
+    assert [(row["env_steps"], row["seed"]) for row in table] == [(n * EPOCH, s) for n in (2, 4) for s in (0, 1)]
+    for row in table:
+        lower, upper = np.array(row["lower"]), np.array(row["upper"])
+        assert np.prod(upper - lower, axis=1).sum() == pytest.approx(24.0**2)
+        same = [r for r in metrics if (r["env_steps"], r["seed"]) == (row["env_steps"], row["seed"])]
+        assert len(lower) == len(row["chosen"]) == same[0]["abstraction/regions"]
 
 
 def test_seeds_differ(finished):
@@ -129,6 +143,7 @@ def test_an_interrupted_run_resumes_to_the_same_final_state_bit_for_bit(finished
     result = trainer.train(load(part / "config.yaml"), part, resume=True, quiet=True)
     assert not result.interrupted
     assert rows(part) == rows(run_dir)
+    assert Journal.of(part).regions.read() == Journal.of(run_dir).regions.read()
     assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
 
 
