@@ -2,14 +2,15 @@
 
     python scripts/verify_abstraction.py RUN [--checkpoint last] [--episodes 512] [--start free] [--out FILE.json]
 
-Agents start anywhere in the free cells and are commanded random regions, so that every decision of k env steps is a
-rollout from a random start of a random pair (region, target). For each seed:
+Agents start anywhere in the free cells and are commanded random targets, so that every decision of k env steps is a
+rollout of a random pair (region, target). That is done three times: among the pairs judged REACHES, among those judged
+MISSES, and among all; who is in a region without such a pair is sent anywhere. For each seed:
 
-    reaches     of the rollouts of pairs judged REACHES, the share that ended in the target; `pairs` is their number
-    misses      of the rollouts of pairs judged MISSES, the share that did not
-    base        of all rollouts between different regions, the share that ended in the target
-    error       root mean square error of the forward model on these rollouts, in units of the state, and `still`, that
-                of the guess that the agent stays where it is
+    reaches     of the first rollouts, of pairs judged REACHES, the share that ended in the target; `pairs` counts them
+    misses      of the second ones, of pairs judged MISSES, the share that did not
+    base        of the third ones, between different regions, the share that ended in the target
+    error       root mean square error of the forward model on these, in units of the state, and `still`, that of the
+                guess that the agent stays where it is
     walls       share of the faces between regions that lie within 1 m of the plane of a wall, and `chance`, the share
                 of all positions in the space that do
 """
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from envs.vector import VectorEnv
@@ -35,14 +37,20 @@ from star.state import Spec, TrainState
 NEAR_WALL = 1.0  # m
 
 
-def rollouts(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, key: jax.Array) -> Any:
-    """(decisions, outcomes) of all periods of one episode under random commands; leading axes [segments, B]."""
-    pairs = state.abstraction.active[:, None] & state.abstraction.active[None, :]
+def rollouts(
+    config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, pairs: jax.Array, key: jax.Array
+) -> Any:
+    """(decisions, outcomes) of all periods of one episode under random commands; leading axes [segments, B].
+
+    Commands are drawn from `pairs` [R, R]; from a region that has none there, from all regions.
+    """
+    active = state.abstraction.active[:, None] & state.abstraction.active[None, :]
+    chosen = jnp.where(pairs.any(axis=1, keepdims=True), pairs, active)
+    allowed = Successors(greedy=active, explore=chosen)
 
     def segment(streams: episode.Streams, key: jax.Array) -> tuple[episode.Streams, Any]:
         command_key, tutor_key, rollout_key, reset_key = jax.random.split(key, 4)
-        everything = Successors(greedy=pairs, explore=pairs)
-        streams = episode.command(config, spec, state, everything, streams, epsilon=1.0, key=command_key)
+        streams = episode.command(config, spec, state, allowed, streams, epsilon=1.0, key=command_key)
         subgoal, _ = episode.choose_subgoal(config, spec, state, streams, deterministic=False, key=tutor_key)
         streams, steps = episode.rollout(
             config, spec, env, state, streams, subgoal, deterministic=False, key=rollout_key
@@ -57,25 +65,30 @@ def rollouts(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState,
     return jax.lax.scan(segment, streams, keys)[1]
 
 
-def judge(config: AgentConfig, spec: Spec, state: TrainState, finished: Any, walls: np.ndarray) -> dict[str, Any]:
-    """The figures of one seed."""
-    decision, outcome = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[2:]), finished)
+def judge(
+    config: AgentConfig, spec: Spec, state: TrainState, finished: dict[str, Any], walls: np.ndarray
+) -> dict[str, Any]:
+    """The figures of one seed. `finished` are the rollouts of "reaches", of "misses" and of "all" pairs."""
+    verdicts = np.asarray(state.graph.verdict)
+
+    def share(name: str, verdict: int | None, arrives: bool) -> dict[str, Any]:
+        decision, _ = finished[name]
+        counted = (decision.weight > 0) & (decision.region != decision.target)
+        if verdict is not None:
+            counted &= verdicts[decision.region, decision.target] == verdict
+        right = (decision.next_region == decision.target)[counted] == arrives
+        pairs = {*zip(decision.region[counted], decision.target[counted], strict=True)}
+        return {"share": float(right.mean()) if right.size else None, "rollouts": right.size, "pairs": len(pairs)}
+
+    decision, outcome = finished["all"]
     counted = (decision.weight > 0) & (decision.region != decision.target)
-    verdict = np.asarray(state.graph.verdict)[decision.region, decision.target]
-    arrived = decision.next_region == decision.target
-
-    def share(mask: np.ndarray, right: np.ndarray) -> dict[str, Any]:
-        n = int((mask & counted).sum())
-        pairs = {*zip(decision.region[mask & counted], decision.target[mask & counted], strict=True)}
-        return {"share": float(right[mask & counted].mean()) if n else None, "rollouts": n, "pairs": len(pairs)}
-
     error = np.asarray(forward_model.errors(config.forward_model, state.forward_model, outcome))
     still = np.square(outcome.start - outcome.end).sum(-1)
     return {
         "regions": int(state.abstraction.count),
-        "reaches": share(verdict == REACHES, arrived),
-        "misses": share(verdict == MISSES, ~arrived),
-        "base": share(np.ones_like(arrived), arrived),
+        "reaches": share("reaches", REACHES, True),
+        "misses": share("misses", MISSES, False),
+        "base": share("all", None, True),
         "error": {"model": _root_mean(error, counted), "still": _root_mean(still, counted)},
         "walls": near_walls(state, walls, np.asarray(spec.space)),
     }
@@ -94,6 +107,11 @@ def near_walls(state: TrainState, walls: np.ndarray, space: np.ndarray) -> dict[
         faces, hits = faces + len(inner), hits + int((distance(inner) <= NEAR_WALL).sum())
         chances.append(float((distance(np.linspace(space[0, axis], space[1, axis], 1001)) <= NEAR_WALL).mean()))
     return {"share": hits / faces if faces else None, "faces": faces, "chance": float(np.mean(chances))}
+
+
+def _flat(x: jax.Array) -> np.ndarray:
+    """The segments [T, B, ...] of all environments one after another."""
+    return np.asarray(x).reshape(-1, *x.shape[2:])
 
 
 def _root_mean(squares: np.ndarray, mask: np.ndarray) -> float | None:
@@ -122,7 +140,13 @@ def main() -> None:
     rows = []
     for i, seed in enumerate(program.seeds):
         state = jax.tree.map(lambda x, i=i: x[i], states)
-        row = {"seed": seed} | judge(agent, spec, state, roll(state, keys[i]), program.walls)
+        graph = state.graph
+        commanded = {"reaches": graph.reaches, "misses": graph.misses, "all": jnp.zeros_like(graph.reaches)}
+        finished = {
+            name: jax.tree.map(_flat, roll(state, pairs, jax.random.fold_in(keys[i], n)))
+            for n, (name, pairs) in enumerate(commanded.items())
+        }
+        row = {"seed": seed} | judge(agent, spec, state, finished, program.walls)
         rows.append(row)
         print(json.dumps(row), flush=True)
     report = {"run": str(options.run), "env": config.env.name, "env_steps": step, "start": options.start, "seeds": rows}

@@ -1,7 +1,6 @@
 import argparse
 import importlib.util
 from pathlib import Path
-from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -124,14 +123,12 @@ def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
     region, target, next_region = seen.T
     weight = np.array([1, 1, 1, 1, 1, 1, 1, 0, 1], np.float32)
     point = np.zeros((9, 2), np.float32)
-    finished = (
-        SimpleNamespace(region=region, target=target, next_region=next_region, weight=weight),
-        Outcome(start=point, lower=point, upper=point, end=point + 3, weight=weight),
-    )
-    stacked = jax.tree.map(lambda x: x[None], (vars(finished[0]), finished[1]))
-    decision = Decision(**stacked[0], goal_region=None, reward=None, lost=None, practised=None)
+    unused = dict.fromkeys(("goal_region", "reward", "lost", "practised"))
+    decision = Decision(region=region, target=target, next_region=next_region, weight=weight, **unused)
+    outcome = Outcome(start=point, lower=point, upper=point, end=point + 3, weight=weight)
     walls = np.array([[2.0, -99.0, 7.5, 99.0]])
-    row = script.judge(agent, spec, state, (decision, stacked[1]), walls)
+    finished = dict.fromkeys(("reaches", "misses", "all"), (decision, outcome))
+    row = script.judge(agent, spec, state, finished, walls)
     assert row["reaches"] == {"share": 0.75, "rollouts": 4, "pairs": 1}
     assert row["misses"] == {"share": 0.5, "rollouts": 2, "pairs": 1}
     assert row["base"]["rollouts"] == 7 and row["error"]["still"] == pytest.approx(18**0.5)
