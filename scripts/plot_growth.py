@@ -2,7 +2,8 @@
 
     python scripts/plot_growth.py RUN --at 1e6 2e6 3e6 [--seed 0] [--out FILE.png]
 
-The last panel is the end of the run. Regions are coloured by how often the Commander chose them of late.
+The last panel is the end of the run. Without --at these are the quarters of the run. Regions are coloured by how often
+the Commander chose them of late.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ def main() -> None:
     """Write the figure and print where it is."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--at", type=float, nargs="+", default=[1e6, 2e6, 3e6], help="env steps")
+    parser.add_argument("--at", type=float, nargs="+", help="env steps")
     parser.add_argument("--seed", type=int)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
@@ -30,9 +31,10 @@ def main() -> None:
     rows = [row for row in rows if options.seed in (None, row["seed"])]
     if not rows:
         parser.error(f"{options.run}: holds no regions.jsonl with rows of the seed asked for")
-    walls = trainer.make_env(load(options.run / "config.yaml"), "test").arena.walls()
+    walls = trainer.make_env(load(options.run / "config.yaml", {"env.engine": "auto"}), "test").arena.walls()
     out = options.out or options.run / "figures" / "growth.png"
-    report.growth_figure(out, regions=rows, walls=np.asarray(walls), moments=[*options.at, np.inf])
+    moments = options.at and [*options.at, np.inf]
+    report.growth_figure(out, regions=rows, walls=np.asarray(walls), moments=moments)
     print(out)
 
 

@@ -147,7 +147,7 @@ def table(reports: list[dict[str, Any]]) -> str:
             ("training_seconds_to_level", "{:.0f} s".format),
             ("seconds_to_level", "{:.0f} s".format),
         ):
-            middle = float(np.median([np.inf if seed.get(key) is None else seed[key] for seed in seeds]))
+            middle = float(np.median([np.inf if seed[key] is None else seed[key] for seed in seeds]))
             cells.append(form(middle) if np.isfinite(middle) else "never")
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

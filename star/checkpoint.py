@@ -16,7 +16,7 @@ from orbax.checkpoint import checkpoint_managers as policies
 from star.config import Config, ConfigError, fields, parse
 from star.state import TrainState
 
-FORMAT = 1
+FORMAT = 2  # since `refinement.neighbours` and `refinement.parts`
 _HARMLESS = (
     "env.engine",
     "trainer.total_env_steps",

@@ -265,9 +265,11 @@ class RefinementConfig(Section):
     )
     reach_share: float = Field(0.7, gt=0, le=1, description="c1: share of the hull inside the target that reaches")
     miss_share: float = Field(0.1, ge=0, lt=1, description="tau2: share of the target covered below which a box misses")
-    depth: Annotated[int, Field(ge=1, le=12)] = Field(8, description="boxes are halved this often at most: 5 is 1/32")
+    depth: Annotated[int, Field(ge=1, le=12)] = Field(
+        8, description="boxes are halved this often at most: 5 makes 1/32 of the region"
+    )
     parts: Annotated[int, Field(ge=2, le=4096)] = Field(
-        32, description="parts of a region at most; those with most visits are halved first"
+        32, description="parts of a region at most; each round of halving begins with those visited most"
     )
     min_visits: Positive = Field(10, description="visited start states a reaching box needs")
     pairs_per_epoch: Positive = Field(16, description="pairs examined after each epoch")

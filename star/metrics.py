@@ -33,15 +33,14 @@ class JsonLines:
         lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
         return [json.loads(line) for line in lines if line.endswith("\n")]
 
-    def keep_until(self, env_steps: int) -> list[dict[str, Any]]:
-        """Drop what was written after `env_steps`, for a run that goes on from there; returns what stays."""
+    def keep_until(self, env_steps: int) -> None:
+        """Drop what was written after `env_steps`, for a run that goes on from there."""
         if not self.path.exists():
-            return []
+            return
         rows = [row for row in self.read() if row["env_steps"] <= env_steps]
         partial = self.path.with_suffix(".partial")
         partial.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
         os.replace(partial, self.path)
-        return rows
 
 
 @dataclass(frozen=True)

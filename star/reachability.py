@@ -8,8 +8,9 @@ exact; a ReLU whose input may have either sign is relaxed as in DeepZ (Singh et 
 The box hull R of the image gives two shares (STAR, ICLR 2024, section 4.3, after AI2, Gehr et al. 2018):
 c1 = vol(R n G) / vol(R) and c2 = vol(R n G) / vol(G). With c1 >= `reach_share` the box REACHES, with
 c2 <= `miss_share` it MISSES, otherwise it is halved along the dimension of largest smear and each half is judged,
-down to 2^-depth of the start. Boxes that agents hardly visited are not looked into, and where there is room for few
-parts only, those with most visits are halved first: precision goes where the agents are.
+down to 2^-depth of the start. Boxes that agents hardly visited are not looked into, and where there is not room for
+all parts, each round of halving has its share of it and begins with those visited most: precision goes where the
+agents are.
 """
 
 from __future__ import annotations
@@ -184,11 +185,11 @@ def examine(
     place = jnp.arange(parts)
     inside = jnp.all((box[0] <= starts) & (starts < box[1]), axis=-1) * seen
 
-    def halve_open(carry: tuple, _: None) -> tuple[tuple, None]:
+    def halve_open(carry: tuple, rounds_left: Array) -> tuple[tuple, None]:
         lower, upper, count, part, found, visits = carry
         open_ = (found == UNKNOWN) & (visits >= min_visits) & (place < count)
         rank = jnp.argsort(jnp.argsort(jnp.where(open_, -visits, 1.0)))  # most visits first, closed ones last
-        halved = open_ & (rank < parts - count)
+        halved = open_ & (rank < (parts - count + rounds_left - 1) // rounds_left)
         dimension, middle = jax.vmap(partial(_halving, network))(lower, upper)
         twin = jnp.where(halved, count + rank, parts)  # where the upper half goes
         at_middle = halved[:, None] & (jnp.arange(lower.shape[1]) == dimension[:, None])
@@ -203,7 +204,7 @@ def examine(
     empty = jnp.broadcast_to(box[1], (parts, len(box[1])))
     lower, part = empty.at[0].set(box[0]), jnp.zeros(starts.shape[0], jnp.int32)
     start = (lower, empty, jnp.ones((), jnp.int32), part, judge_all(lower, empty), _visits(part, inside, parts))
-    (lower, upper, count, _, found, visits), _ = jax.lax.scan(halve_open, start, None, length=depth)
+    (lower, upper, count, _, found, visits), _ = jax.lax.scan(halve_open, start, jnp.arange(depth, 0, -1))
     used, enough = place < count, visits >= min_visits
     return Leaves(
         lower=lower, upper=upper, reaches=used & enough & (found == REACHES), visited=used & enough, used=used
@@ -212,17 +213,13 @@ def examine(
 
 def summary(leaves: Leaves) -> Int[Array, ""]:
     """REACHES if all leaves reach, MISSES if none does, else MIXED."""
-    return _verdict(leaves.reaches, leaves.used)
+    some, every = leaves.reaches.any(), (leaves.reaches | ~leaves.used).all()
+    return jnp.where(every, REACHES, jnp.where(some, MIXED, MISSES))
 
 
-def summary_of_visited(leaves: Leaves) -> Int[Array, ""]:
-    """The same of the visited leaves alone; UNKNOWN if there are none."""
-    return jnp.where(leaves.visited.any(), _verdict(leaves.reaches, leaves.visited), UNKNOWN)
-
-
-def _verdict(reaches: Bool[Array, "L"], counted: Bool[Array, "L"]) -> Int[Array, ""]:
-    some, all_ = (reaches & counted).any(), (reaches | ~counted).all()
-    return jnp.where(all_, REACHES, jnp.where(some, MIXED, MISSES))
+def reaches_where_visited(leaves: Leaves) -> Bool[Array, ""]:
+    """Whether there are visited leaves and all of them reach."""
+    return leaves.visited.any() & (leaves.reaches | ~leaves.visited).all()
 
 
 def _visits(part: Int[Array, "N"], counted: Float[Array, "N"], parts: int) -> Float[Array, "P"]:

@@ -4,12 +4,12 @@
         it was commanded `min_transitions` times since i or j last changed,
         it has no verdict, and
         the forward model's held-out error on it has stopped falling
-    the due pair with most transitions times epochs of waiting is examined (star/reachability.py):
+    the due pair with most transitions times epochs since it was examined is taken (star/reachability.py):
         all parts of i reach j:  edge i -> j, REACHES
         none does:               MISSES, for `miss_lifetime` epochs, since the low levels are still learning
         some do:                 cut i along the axis that best parts the reaching from the missing leaves
-    where no cut is made, since none is possible or (`neighbours`) i and j do not touch, the parts of i where agents
-    have been decide: all of them, none, or no verdict
+    where no cut is made, since none is possible or (`neighbours`) i and j do not touch, there is an edge if all parts
+    of i where agents have been reach j, else no verdict
 
 With `within`, pairs (i, i) are examined too: does a region reach the goals inside it? They count decisions of agents
 in i whose goal lies in i. One of their goals is drawn, if possible one that was reached, and the square inside its
@@ -42,6 +42,7 @@ class Graph(struct.PyTreeNode):
 
     verdict: Int[Array, "R R"]
     age: Int[Array, "R R"]
+    """Epochs since the pair, or that it was cut from, was examined."""
     transitions: Float[Array, "R R"]
     error: Float[Array, "R R"]
     stable: Bool[Array, "R R"]
@@ -133,19 +134,14 @@ def best_cut(
     leaves: Leaves,
     *,
     min_width: float | Array,
-    key: Array | None = None,
 ) -> tuple[Cut, Float[Array, ""]]:
     """The cut of one of the `candidates` that best parts reaching from missing leaves, and what it gains.
 
     The gain is the decrease of Gini impurity, as in a decision tree: the impurity of a part with volume v, of which r
     reaches, is r (v - r) / v; it is given as a share of the volume of all leaves. Cuts lie on leaf boundaries and
-    leave both parts at least `min_width` wide. With `key` a cut is drawn at random instead, anywhere in the leaves.
+    leave both parts at least `min_width` wide.
     """
     positions = leaves.upper.T  # those of places not in use lie on the faces of the box, where nothing can be cut
-    if key is not None:
-        position_key, key = jax.random.split(key)
-        low, high = leaves.lower.min(axis=0), leaves.upper.max(axis=0)
-        positions = jax.random.uniform(position_key, positions.shape, minval=low[:, None], maxval=high[:, None])
     volume = jnp.prod(leaves.upper - leaves.lower, axis=-1)
 
     def overlap(lower: Array, upper: Array) -> Float[Array, "L"]:
@@ -162,8 +158,6 @@ def best_cut(
         below = overlap(lower, upper.at[dimension].set(jnp.minimum(position, upper[dimension])))
         whole = overlap(lower, upper)
         decrease = impurity(whole) - impurity(below) - impurity(whole - below)
-        if key is not None:
-            decrease = volume.sum()
         return jnp.where(wide & candidates[region], decrease / volume.sum(), 0.0)
 
     d, count = positions.shape
@@ -171,11 +165,18 @@ def best_cut(
     over_positions = jax.vmap(gain, in_axes=(None, None, 0))
     over_dimensions = jax.vmap(over_positions, in_axes=(None, 0, 0))
     gains = jax.vmap(over_dimensions, in_axes=(0, None, None))(every_region, every_dimension, positions)
-    if key is not None:
-        gains *= jax.random.uniform(key, gains.shape, minval=0.5)
     best = jnp.argmax(gains)
     region, dimension, index = jnp.unravel_index(best, (abstraction.capacity, d, count))
     return Cut(region=region, dimension=dimension, position=positions[dimension, index]), gains.reshape(-1)[best]
+
+
+def random_cut(abstraction: Abstraction, region: Int[Array, ""], *, min_width: float | Array, key: Array) -> Cut:
+    """A cut of `region` anywhere along any dimension that leaves both parts at least `min_width` wide."""
+    dimension_key, position_key = jax.random.split(key)
+    lowest, highest = abstraction.lower[region] + min_width, abstraction.upper[region] - min_width
+    dimension = jax.random.categorical(dimension_key, jnp.where(lowest <= highest, 0.0, -jnp.inf))
+    position = jax.random.uniform(position_key, minval=lowest[dimension], maxval=highest[dimension])
+    return Cut(region=region, dimension=dimension, position=position)
 
 
 class Split(struct.PyTreeNode):
@@ -229,10 +230,11 @@ def refine(
             ),
         )
         mixed = judged & (verdict == MIXED)
+        cuttable = mixed
         if config.refinement.neighbours:
-            mixed &= inside | regions.adjacent(abstraction)[region, target]
-        abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed, key=cut_key)
-        verdict = jnp.where((verdict == MIXED) & ~splits.done.any(), reachability.summary_of_visited(leaves), verdict)
+            cuttable &= inside | regions.adjacent(abstraction)[region, target]
+        abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, cuttable, key=cut_key)
+        verdict = jnp.where(mixed & ~splits.done.any() & reachability.reaches_where_visited(leaves), REACHES, verdict)
         settled = judged & ~inside & ((verdict == REACHES) | (verdict == MISSES))
         known = jnp.where(settled, verdict, graph.verdict[region, target])
         graph = graph.replace(verdict=graph.verdict.at[region, target].set(known))
@@ -323,8 +325,9 @@ def _cut(
     def one_cut(carry: tuple, cut_key: Array) -> tuple[tuple, Split]:
         abstraction, graph, parts = carry
         min_width = config.abstraction.min_width
-        random = cut_key if config.refinement.cuts == "random" else None
-        cut, gain = best_cut(abstraction, parts, leaves, min_width=min_width, key=random)
+        cut, gain = best_cut(abstraction, parts, leaves, min_width=min_width)
+        if config.refinement.cuts == "random":
+            cut = random_cut(abstraction, cut.region, min_width=min_width, key=cut_key)
         child = abstraction.count
         after, possible = regions.split(abstraction, cut, min_width=min_width)
         split = Split(

@@ -21,7 +21,7 @@ _GROWTH_PANELS = 4
 Row = Mapping[str, Any]
 
 
-def region_rows(state: TrainState, seeds: Sequence[int], *, env_steps: int) -> list[Row]:
+def region_rows(state: TrainState, seeds: Sequence[int], *, env_steps: int) -> list[dict[str, Any]]:
     """The abstraction of every seed (leading axis of `state`) as plain values, a row of `regions.jsonl` each.
 
     `lower` and `upper` are the corners of the regions in use, `chosen` how often the Commander chose each of late.
@@ -58,12 +58,13 @@ def growth_figure(
 ) -> None:
     """Draw the abstraction of the first seed in `regions` at `moments` (env steps), by default quarters of the run.
 
-    Each moment shows the first row at or after it, or the last one.
+    Each moment shows the first row at or after it, or the last one; no row is shown twice.
     """
     rows = [row for row in regions if row["seed"] == regions[0]["seed"]]
     if moments is None:
         moments = [rows[-1]["env_steps"] * (i + 1) / _GROWTH_PANELS for i in range(_GROWTH_PANELS)]
-    shown = [next((row for row in rows if row["env_steps"] >= moment), rows[-1]) for moment in moments]
+    found = [next((row for row in rows if row["env_steps"] >= moment), rows[-1]) for moment in moments]
+    shown = list({row["env_steps"]: row for row in found}.values())
     figure = Figure(figsize=(4.6 * len(shown), 4.4), layout="constrained")
     axes = list(np.atleast_1d(figure.subplots(1, len(shown))))
     titles = [f"{len(row['chosen'])} regions at {row['env_steps'] / 1e6:.3g} M env steps" for row in shown]

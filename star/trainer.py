@@ -184,13 +184,14 @@ def _loop(
     config, seeds = program.config.trainer, program.seeds
     rows, regions = journal.metrics.read(), journal.regions.read()
     done = int(state.epoch[0])
+    env_steps = done * program.env_steps_per_epoch
     began = time.monotonic() - (rows[-1]["wall_s"] if rows else 0.0)
     success = _latest_success(rows)
     saved = done if checkpoints.steps() else -1
     display = Display(
         console,
         total_env_steps=program.epochs * program.env_steps_per_epoch,
-        done_env_steps=done * program.env_steps_per_epoch,
+        done_env_steps=env_steps,
         quiet=quiet,
     )
     with display, _interruptible() as interrupted:
@@ -205,9 +206,9 @@ def _loop(
                 _add_evaluation(table, program.evaluate(state, evaluation_keys(program, done)))
                 success = mean(table, "eval/success_final")
                 if program.config.commander.enabled:
-                    for region_row in report.region_rows(state, seeds, env_steps=env_steps):
+                    regions.extend(report.region_rows(state, seeds, env_steps=env_steps))
+                    for region_row in regions[-len(seeds) :]:
                         journal.regions.write(region_row)
-                        regions.append(dict(region_row))
             for row in table:
                 row |= {"env_steps": env_steps, "wall_s": round(time.monotonic() - began, 3)}
                 row |= {"env_steps_per_s": round(speed)}
@@ -219,11 +220,13 @@ def _loop(
                 saved = done
         stopped = done < program.epochs
         if saved != done:
-            checkpoints.save(done * program.env_steps_per_epoch, state, program.config, success=_or_zero(success))
+            checkpoints.save(env_steps, state, program.config, success=_or_zero(success))
+    if program.config.commander.enabled and not (regions and regions[-1]["env_steps"] == env_steps):
+        regions.extend(report.region_rows(state, seeds, env_steps=env_steps))  # stopped between evaluations
     report.summary_figure(run_dir / "figures" / "summary.png", regions=regions, rows=rows, walls=program.walls)
     if regions:
         report.growth_figure(run_dir / "figures" / "growth.png", regions=regions, walls=program.walls)
-    return Result(run_dir, done * program.env_steps_per_epoch, stopped, success)
+    return Result(run_dir, env_steps, stopped, success)
 
 
 def _rows(metrics: dict[str, jax.Array], seeds: list[int]) -> list[dict[str, Any]]:

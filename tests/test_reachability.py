@@ -159,15 +159,32 @@ def test_leaves_are_those_of_a_plain_recursion(examine, seed):
 
 
 def test_where_room_is_scarce_the_parts_with_most_visits_are_halved():
-    narrow = displaced(*f32(np.zeros(1)))
-    starts, seen = f32(np.array([[0.1]] * 5 + [[6.5]] * 9 + [[6.9]]), np.ones(15))
+    # Every point is carried by +4 along x, so that of [0, 8] only [0.25, 7.75] reaches [4.25, 11.75]: both halves are
+    # mixed, and there is room to halve only one of them. Nobody was in what is left of the other.
+    move = displaced(*f32(np.full(1, 4.0)))
+    corners = f32([0.0], [8.0]), f32([4.25], [11.75])
+    for few, many in (([1.0], [6.0]), ([6.0], [1.0])):
+        starts, seen = f32(np.array([few] * 5 + [many] * 9), np.ones(14))
+        leaves = reachability.examine(
+            move, *corners, starts, seen, depth=2, parts=3, reach_share=0.999, miss_share=0.0, min_visits=1
+        )
+        lower, upper, _ = used(leaves)
+        halved = 0.0 if many == [1.0] else 4.0
+        assert sorted(zip(lower[:, 0], upper[:, 0], strict=True)) == sorted(
+            [(4.0 - halved, 8.0 - halved), (halved, halved + 2), (halved + 2, halved + 4)]
+        )
+
+
+def test_early_rounds_of_halving_leave_room_for_later_ones():
+    # All of [0, 16] is mixed at every depth; the part visited most is still halved in the last round.
+    starts, seen = f32(np.concatenate([np.full((99, 1), 0.1), np.linspace(0.2, 15.8, 64)[:, None]]), np.ones(163))
     leaves = reachability.examine(
-        narrow, f32([0.0], [8.0]), f32([6.25], [8.0]), starts, seen,
-        depth=4, parts=4, reach_share=0.999, miss_share=0.0, min_visits=1,
+        displaced(*f32(np.zeros(1))), f32([0.0], [16.0]), f32([-99.0], [99.0]), starts, seen,
+        depth=6, parts=12, reach_share=2.0, miss_share=0.0, min_visits=1,
     )  # fmt: skip
-    lower, upper, reaches = used(leaves)
-    parts = sorted(zip(lower[:, 0], upper[:, 0], reaches, strict=True))
-    assert parts == [(0, 4, False), (4, 6, False), (6, 7, False), (7, 8, False)]  # (7, 8) has no visits
+    lower, upper, _ = used(leaves)
+    assert len(lower) == 12
+    assert (upper - lower).min() == 16 / 2**6
 
 
 def test_parts_that_stay_undecided_do_not_reach(examine):
@@ -210,16 +227,16 @@ def test_summary_of_leaves(reaches, verdict):
 
 
 @pytest.mark.parametrize(
-    ("reaches", "visited", "verdict"),
+    ("reaches", "visited", "whole"),
     [
-        ((True, False), (True, False), REACHES),
-        ((True, False), (False, True), MISSES),
-        ((True, False), (True, True), MIXED),
-        ((True, True), (False, False), UNKNOWN),
+        ((True, False), (True, False), True),
+        ((True, False), (True, True), False),
+        ((False, False), (True, False), False),
+        ((False, False), (False, False), False),
     ],
 )
-def test_summary_of_the_leaves_where_agents_have_been(reaches, visited, verdict):
-    assert int(reachability.summary_of_visited(leaves_of(reaches, visited))) == verdict
+def test_whether_all_leaves_reach_where_agents_have_been(reaches, visited, whole):
+    assert bool(reachability.reaches_where_visited(leaves_of(reaches, visited))) == whole
 
 
 def leaves_of(reaches, visited):

@@ -295,17 +295,20 @@ def test_no_region_is_cut_narrower_than_min_width(refine, moving):
         assert int(abstraction.count) == count
 
 
-@pytest.mark.parametrize(("shift", "verdict"), [(6, REACHES), (-6, MISSES)])
-def test_where_no_cut_is_possible_the_parts_where_agents_have_been_decide(refine, moving, shift, verdict):
-    # From the right part of region 0 a step of +6 leads to region 2 and one of -6 does not; nobody was in the left one.
+@pytest.mark.parametrize(("target", "by"), [(2, (6, 0)), (3, (6, 6))])
+@pytest.mark.parametrize(("everywhere", "verdict"), [(False, REACHES), (True, UNKNOWN)])
+def test_where_no_cut_is_made_there_is_an_edge_if_all_parts_that_agents_visit_reach(
+    refine, moving, target, by, everywhere, verdict
+):
+    # Only from x >= 2, and y >= 2, region 0 is carried into regions 2 and 3. Its parts would be narrower than 6.5.
     chosen = settings(**{"abstraction.min_width": 6.5})
-    model = moving((shift, 0))
+    model = moving(by)
     items, _ = replay.contents(model.ring)
-    x, y = items.start[:, 0], items.start[:, 1]
-    seen = items.replace(start=jnp.stack([jnp.where(x < 2, x + 6, x), y], axis=1))
-    _, graph, _, metrics = refine(chosen, grid(), knowing((0, 2)), model.replace(ring=replay.add(model.ring, seen)))
-    assert int(metrics["splits"]) == 0
-    assert int(graph.verdict[0, 2]) == verdict
+    starts = items.start if everywhere else jnp.where(items.start < 2, items.start + 6, items.start)
+    model = model.replace(ring=replay.add(model.ring, items.replace(start=starts)))
+    _, graph, _, metrics = refine(chosen, grid(), knowing((0, target)), model)
+    assert int(metrics["mixed"]) == 1 and int(metrics["splits"]) == 0
+    assert int(graph.verdict[0, target]) == verdict
 
 
 @pytest.mark.parametrize(("target", "by", "cuts"), [(2, (6, 0), 1), (3, (6, 6), 0)])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import signal
 import subprocess
@@ -12,11 +13,12 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
 
-from star import cli, trainer
+from star import cli, report, trainer
 from star.checkpoint import Checkpoints
 from star.config import ConfigError, load, parse
 from star.metrics import Journal, JsonLines
@@ -121,6 +123,19 @@ def test_regions_have_a_line_for_each_evaluation_and_seed_and_cover_the_space(fi
         assert len(lower) == len(row["chosen"]) == same[0]["abstraction/regions"]
 
 
+@pytest.mark.parametrize(
+    ("moments", "shown"),
+    [(None, [10, 20, 30, 40]), ([5, 15], [10, 20]), ([20, 25, 28, math.inf], [20, 30, 40])],
+)
+def test_the_figure_of_growth_shows_the_regions_at_the_moments_asked_for(tmp_path, monkeypatch, moments, shown):
+    box = {"lower": [[0.0, 0.0]], "upper": [[1.0, 1.0]], "chosen": [1.0]}
+    regions = [{"seed": seed, "env_steps": n} | box for n in (10, 20, 30, 40) for seed in (3, 4)]
+    drawn = []
+    monkeypatch.setattr(report, "draw_regions", lambda axis, row, walls: drawn.append((row["seed"], row["env_steps"])))
+    report.growth_figure(tmp_path / "growth.png", regions=regions, walls=[], moments=moments)
+    assert drawn == [(3, n) for n in shown]
+
+
 def test_seeds_differ(finished):
     run_dir, _ = finished
     first, second = rows(run_dir)[-2:]
@@ -154,7 +169,8 @@ def test_metrics_written_after_the_checkpoint_are_dropped_on_resume(finished, tm
         sink.write(row)
     with sink.path.open("a") as file:
         file.write('{"env_steps": 1, "half a li')
-    assert [row["env_steps"] for row in sink.keep_until(2 * EPOCH)] == [EPOCH, EPOCH, 2 * EPOCH, 2 * EPOCH]
+    sink.keep_until(2 * EPOCH)
+    assert [row["env_steps"] for row in sink.read()] == [EPOCH, EPOCH, 2 * EPOCH, 2 * EPOCH]
     assert len(sink.path.read_text().splitlines()) == 4
 
 
@@ -207,6 +223,24 @@ def test_a_checkpoint_of_another_shape_or_environment_is_refused(finished, overr
         trainer.train(tiny(**override), run_dir, resume=True, quiet=True)
     assert named in str(error.value) and "\n" not in str(error.value)
     assert (run_dir / "metrics.jsonl").read_bytes() == before
+
+
+def test_a_checkpoint_loads_on_a_machine_without_the_device_it_was_saved_on(tmp_path):
+    saving = """
+import sys, jax, jax.numpy as jnp
+from pathlib import Path
+from star.checkpoint import Checkpoints
+from star.config import Config
+state = {"x": jax.device_put(jnp.arange(3.0), jax.devices()[1])}
+checkpoints = Checkpoints(Path(sys.argv[1]))
+checkpoints.save(7, state, Config(), success=0.0)
+checkpoints.close()
+"""
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    subprocess.run([sys.executable, "-c", saving, str(tmp_path)], env=environment, check=True)
+    checkpoints = Checkpoints(tmp_path)
+    np.testing.assert_array_equal(checkpoints.restore(7, {"x": jnp.zeros(3)})["x"], [0, 1, 2])
+    checkpoints.close()
 
 
 def test_a_numeric_hyperparameter_may_change_on_resume(finished, tmp_path):
