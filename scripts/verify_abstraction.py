@@ -29,7 +29,7 @@ import numpy as np
 
 from envs.vector import VectorEnv
 from star import episode, forward_model, hierarchy, trainer
-from star.commander import Successors
+from star.commander import Decision, Successors
 from star.config import AgentConfig, load
 from star.reachability import MISSES, REACHES
 from star.state import Spec, TrainState
@@ -73,7 +73,7 @@ def judge(
 
     def share(name: str, verdict: int | None, arrives: bool) -> dict[str, Any]:
         decision, _ = finished[name]
-        counted = (decision.weight > 0) & (decision.region != decision.target)
+        counted = _complete(decision)
         if verdict is not None:
             counted &= verdicts[decision.region, decision.target] == verdict
         right = (decision.next_region == decision.target)[counted] == arrives
@@ -81,7 +81,7 @@ def judge(
         return {"share": float(right.mean()) if right.size else None, "rollouts": right.size, "pairs": len(pairs)}
 
     decision, outcome = finished["all"]
-    counted = (decision.weight > 0) & (decision.region != decision.target)
+    counted = _complete(decision)
     error = np.asarray(forward_model.errors(config.forward_model, state.forward_model, outcome))
     still = np.square(outcome.start - outcome.end).sum(-1)
     return {
@@ -107,6 +107,11 @@ def near_walls(state: TrainState, walls: np.ndarray, space: np.ndarray) -> dict[
         faces, hits = faces + len(inner), hits + int((distance(inner) <= NEAR_WALL).sum())
         chances.append(float((distance(np.linspace(space[0, axis], space[1, axis], 1001)) <= NEAR_WALL).mean()))
     return {"share": hits / faces if faces else None, "faces": faces, "chance": float(np.mean(chances))}
+
+
+def _complete(decision: Decision) -> np.ndarray:
+    """Which decisions lasted k env steps and aimed at another region."""
+    return (decision.weight > 0) & (decision.region != decision.target)
 
 
 def _flat(x: jax.Array) -> np.ndarray:

@@ -213,14 +213,8 @@ def refine(
         found = waiting[region, target]
         inside = region == target
         goal_key, cut_key = jax.random.split(pair_key)
-        goal, there = _draw_goal(abstraction, region, goals, key=goal_key)
-        judged = found & (~inside | there)
-        commanded = (
-            jnp.where(inside, goal[0], abstraction.lower[target]),
-            jnp.where(inside, goal[1], abstraction.upper[target]),
-        )
-        widened = _widening((goal[1] - goal[0]) / 2, radius) * inside
-        wanted = (commanded[0] - widened, commanded[1] + widened)
+        commanded, wanted, there = _boxes(abstraction, region, target, goals, radius=radius, key=goal_key)
+        judged = found & there
         leaves = _examine(config, abstraction, model, region, commanded, wanted, starts, seen)
         verdict = reachability.summary(leaves)
         graph = graph.replace(
@@ -273,6 +267,23 @@ def on_split(graph: Graph, split: Split) -> Graph:
 def _widening(half: Float[Array, "*n d"], radius: float | Array) -> Float[Array, "*n d"]:
     """What a box of half-widths `half` lacks to the cube inside a ball of that radius."""
     return jnp.maximum(radius / half.shape[-1] ** 0.5 - half, 0.0)
+
+
+def _boxes(
+    abstraction: Abstraction, region: Array, target: Array, goals: Goals, *, radius: float | Array, key: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array], Bool[Array, ""]]:
+    """The box that is commanded to examine a pair, the box that is to be reached, and whether there is one.
+
+    Both are the target region, or where that is the region itself the box around a goal in it, and the widened one.
+    """
+    inside = region == target
+    goal, there = _draw_goal(abstraction, region, goals, key=key)
+    commanded = (
+        jnp.where(inside, goal[0], abstraction.lower[target]),
+        jnp.where(inside, goal[1], abstraction.upper[target]),
+    )
+    widened = _widening((goal[1] - goal[0]) / 2, radius) * inside
+    return commanded, (commanded[0] - widened, commanded[1] + widened), ~inside | there
 
 
 def _draw_goal(
