@@ -1,20 +1,20 @@
 """Train and evaluate the agents of a results table, and draw their curves.
 
-    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--one-by-one] [--out results/TASK] [-- SETTINGS]
+    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--one-by-one] [--out FOLDER] [-- SETTINGS]
 
 TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents or configs/ablations laid
 over it; by default all agents. SETTINGS are passed on to `star train`. For each name the seeds are trained side by side
 in one program, or with --one-by-one one after another, which is how wall-clock times to a success are meant to be
-taken. Into the folder go
+taken. Into results/TASK, or results/TASK/one_by_one, go
 
     NAME.json     every seed's success on `--episodes` greedy episodes on test goals; env steps to success_any .9 (null:
                   never), seconds of training to it, and seconds since the start of the run, with compilation and
-                  evaluations; the command, commit, device and versions
+                  evaluations; of every program its seeds, command, commit, device and versions
     curves.jsonl  all evaluations during training
     curves.png    success_any over env steps and over wall-clock: mean over seeds and their range
     table.md      means over seeds and interquartile means with 95 % bootstrap intervals
 
-A name whose JSON exists is not trained again. Runs are kept under `--runs`; one that was interrupted goes on, so empty
+Seeds that a JSON already holds are not trained again. Runs are kept under `--runs`; one that was interrupted goes on, so empty
 that folder when code or settings have changed.
 """
 
@@ -53,44 +53,44 @@ def layer(name: str) -> list[str]:
     raise SystemExit(f"error: {name}: no such agent; known are star, {', '.join(known)}")
 
 
-def measure(task: str, name: str, options: argparse.Namespace, settings: list[str]) -> tuple[dict[str, Any], list]:
-    """Train and evaluate one agent: what goes into its JSON, and its evaluations during training."""
-    groups = [[seed] for seed in range(options.seeds)] if options.one_by_one else [list(range(options.seeds))]
-    rows: list[dict[str, Any]] = []
-    evaluated: list[dict[str, Any]] = []
-    commands = []
-    for seeds in groups:
-        run = options.runs / task / f"{name}-{seeds[0]}"
-        chosen = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), *settings]
-        train = ["train", f"configs/{task}.yaml", *layer(name), *chosen, "--run-dir", str(run)]
-        if (run / "checkpoints").exists():  # interrupted, or done
-            subprocess.run([*STAR, "train", "--resume", str(run)], cwd=ROOT, check=True)
-        else:
-            subprocess.run([*STAR, *train], cwd=ROOT, check=True)
-        commands.append(shlex.join(["star", *train]))
-        rows += [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
-        evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--json"]
-        report = subprocess.run(evaluate, cwd=ROOT, check=True, capture_output=True, text=True).stdout
-        evaluated += json.loads(report.splitlines()[-1])["seeds"]
+def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace, settings: list[str]) -> dict[str, Any]:
+    """Train and evaluate `seeds` of one agent in one program: its metrics, their evaluation, and how it was run."""
+    run = options.runs / task / f"{name}-{seeds[0]}"
+    chosen = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), *settings]
+    train = ["train", f"configs/{task}.yaml", *layer(name), *chosen]
+    if (run / "checkpoints").exists():  # interrupted, or done
+        subprocess.run([*STAR, "train", "--resume", str(run)], cwd=ROOT, check=True)
+    else:
+        subprocess.run([*STAR, *train, "--run-dir", str(run)], cwd=ROOT, check=True)
+    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
+    evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--json"]
+    report = subprocess.run(evaluate, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    return {
+        "rows": rows,
+        "evaluated": json.loads(report.splitlines()[-1])["seeds"],
+        "run": {"seeds": seeds, "command": shlex.join(["star", *train])} | provenance(options.commit),
+    }
+
+
+def summarise(task: str, name: str, old: dict[str, Any], measured: dict[str, Any]) -> tuple[dict[str, Any], list]:
+    """What goes into an agent's JSON, the seeds of the `old` one included, and the new evaluations during training."""
+    rows = measured["rows"]
     keys = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
     curve = [{"name": name} | {k: row[k] for k in keys if k in row} for row in rows if "eval/success_any" in row]
     speed = float(np.median([row["env_steps_per_s"] for row in rows]))  # of the seeds of a program together
-    for seed in evaluated:
+    for seed in measured["evaluated"]:
         first = next((p for p in curve if p["seed"] == seed["seed"] and p["eval/success_any"] >= LEVEL), None)
         seed |= {
             "env_steps_to_level": first and first["env_steps"],
-            "training_seconds_to_level": first and round(first["env_steps"] * len(groups[0]) / speed, 1),
+            "training_seconds_to_level": first and round(first["env_steps"] * len(measured["evaluated"]) / speed, 1),
             "seconds_to_level": first and first["wall_s"],
         }
     return {
         "task": task,
         "name": name,
-        "seeds": evaluated,
-        "one_by_one": options.one_by_one,
         "env_steps_per_seed": max(row["env_steps"] for row in rows),
-        "env_steps_per_s": speed,
-        "commands": commands,
-        **provenance(options.commit),
+        "seeds": [*old.get("seeds", []), *measured["evaluated"]],
+        "runs": [*old.get("runs", []), measured["run"] | {"env_steps_per_s": speed}],
     }, curve
 
 
@@ -198,17 +198,19 @@ def main(arguments: list[str] | None = None) -> None:
     for name in options.names:
         layer(name)
 
-    out = options.out or ROOT / "results" / options.task
+    out = options.out or ROOT / "results" / options.task / ("one_by_one" if options.one_by_one else "")
     out.mkdir(parents=True, exist_ok=True)
     record = out / "curves.jsonl"
     for name in options.names:
-        if (out / f"{name}.json").exists():
-            continue
-        report, curve = measure(options.task, name, options, settings)
-        old = [json.loads(line) for line in record.read_text(encoding="utf-8").splitlines()] if record.exists() else []
-        kept = [point for point in old if point["name"] != name] + curve
-        record.write_text("".join(json.dumps(point) + "\n" for point in kept), encoding="utf-8")
-        (out / f"{name}.json").write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+        path = out / f"{name}.json"
+        report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        missing = sorted(set(range(options.seeds)) - {seed["seed"] for seed in report.get("seeds", [])})
+        for seeds in [[seed] for seed in missing] if options.one_by_one else [missing] * bool(missing):
+            measured = measure(options.task, name, seeds, options, settings)
+            report, curve = summarise(options.task, name, report, measured)
+            with record.open("a", encoding="utf-8") as file:
+                file.writelines(json.dumps(point) + "\n" for point in curve)
+            path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     reports = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(out.glob("*.json"))]
     reports.sort(key=lambda report: (report["name"] != "star", report["name"]))
     (out / "table.md").write_text(table(reports), encoding="utf-8")
