@@ -64,6 +64,17 @@ class Geometry:
     region_cuts: tuple[Point, ...]
     subgoal_scale: Point
 
+    def with_heading(self, cosine: int) -> Geometry:
+        """The same with cosine and sine of the yaw, at index `cosine` and the next, as two more abstract dimensions."""
+        lower, upper = self.space
+        return replace(
+            self,
+            abstract_indices=(*self.abstract_indices, cosine, cosine + 1),
+            space=((*lower, -1.0, -1.0), (*upper, 1.0, 1.0)),
+            region_cuts=(*self.region_cuts, (), ()),
+            subgoal_scale=(*self.subgoal_scale, 1.0, 1.0),
+        )
+
     def resized(self, ratio: float) -> Geometry:
         """The same geometry at `ratio` times the size in x and y."""
         lower, upper = self.space
@@ -165,6 +176,7 @@ COMMON: Mapping[str, Option] = {
 }
 
 ANT: Mapping[str, Option] = {
+    "abstract": choice("position", "pose"),
     "flip": choice("ignore", "terminate", "truncate"),
     "preset": choice(*PRESETS),
     "collisions": choice("all", "feet"),
@@ -313,7 +325,7 @@ FALL_GEOMETRY = Geometry(
     goal_indices=(0, 1, 2),
     abstract_indices=(0, 1, 2),
     space=((-4.0, -4.0, 0.0), (12.0, 28.0, 8.0)),
-    region_cuts=((4.0,), (12.0,), ()),
+    region_cuts=((4.0,), (16.0,), ()),
     subgoal_scale=(10.0, 10.0, 0.5),
 )
 

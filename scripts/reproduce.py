@@ -14,8 +14,8 @@ taken. Into results/TASK, or results/TASK/one_by_one, go
     curves.png    success_any over env steps and over wall-clock: mean over seeds and their range
     table.md      means over seeds and interquartile means with 95 % bootstrap intervals
 
-Seeds that a JSON already holds are not trained again. Runs are kept under `--runs`; one that was interrupted goes on, so empty
-that folder when code or settings have changed.
+Seeds that a JSON already holds are not trained again. Runs are kept under `--runs`; one that was interrupted goes on,
+so empty that folder when code or settings have changed.
 """
 
 from __future__ import annotations

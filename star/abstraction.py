@@ -120,11 +120,6 @@ def split(abstraction: Abstraction, cut: Cut, *, min_width: float | Array) -> tu
     )
 
 
-def centre(abstraction: Abstraction) -> Float[Array, "R d"]:
-    """Centres of all boxes."""
-    return (abstraction.lower + abstraction.upper) / 2
-
-
 def adjacent(abstraction: Abstraction) -> Bool[Array, "R R"]:
     """Which active regions share a face; none is its own neighbour."""
     lower = jnp.maximum(abstraction.lower[:, None], abstraction.lower[None])

@@ -127,6 +127,16 @@ def epsilon(config: CommanderConfig, env_steps: Float[Array, ""]) -> Float[Array
     return config.epsilon_start + progress * (config.epsilon_end - config.epsilon_start)
 
 
+def spread(config: CommanderConfig, share: Float[Array, ""], *, num_envs: int) -> Float[Array, "B"]:
+    """Share of random choices of each environment, `share` on average.
+
+    Spread from none to twice as much, some environments walk a long way to its end while others leave it often (as in
+    Ape-X, Horgan et al. 2018).
+    """
+    even = (jnp.arange(num_envs) + 0.5) * (2 / num_envs)
+    return share * (even if config.epsilon_spread else jnp.ones(num_envs))
+
+
 def practice(config: CommanderConfig) -> Float[Array, ""] | float:
     """Share of the environments that practise: none without a Commander, since there is nobody to send them."""
     return config.practice if config.enabled else 0.0
@@ -139,7 +149,7 @@ def act(
     goal_region: Int[Array, "B"],
     *,
     practised: Int[Array, "B"] | None = None,
-    epsilon: Float[Array, ""] | float,
+    epsilon: Float[Array, "B"] | float,
     key: Array,
 ) -> Int[Array, "B"]:
     """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random.
@@ -182,12 +192,11 @@ def plan(
     allowed: Successors,
     *,
     believed: Bool[Array, "R R"],
-    hoped: Float[Array, "R R"],
 ) -> CommanderState:
     """`config.sweeps` sweeps of value iteration on the model, from the values of last time.
 
-    As long as nothing is known, region j is held reachable from i where `believed` [i, j], and the reward in region i
-    for goals in region g is taken to be `hoped` [i, g], and a success where i aims at itself.
+    As long as nothing is known, region j is held reachable from i where `believed` [i, j], and who aims at a goal in
+    his own region is taken to succeed (or, with rewards that are negative, to lose nothing anywhere).
     """
     model, size = state.model, state.chosen.shape[0]
     assert model is not None
@@ -196,7 +205,7 @@ def plan(
     led = model.led + config.prior * expected
     chances = led / (led.sum(axis=-1) + model.lost)[..., None]
     arrived = (config.reward == "success") * identity[:, :, None] * identity[:, None]
-    reward = (model.rewards + config.prior * (hoped[..., None] + arrived)) / (model.visits + config.prior)
+    reward = (model.rewards + config.prior * arrived) / (model.visits + config.prior)
 
     rewards = jnp.stack([reward, jnp.broadcast_to(identity[..., None], reward.shape)])
 
@@ -243,16 +252,12 @@ def _td_error(
     return batch.reward + config.discount * future - state.q[batch.region, batch.goal_region, batch.target]
 
 
-def worth(
-    config: CommanderConfig, distance: Float[Array, "*n"], success: Float[Array, "*n"] | float, diameter: float | Array
-) -> Float[Array, "*n"]:
-    """The Commander's reward of one env step at a distance from g* in a space of that diameter.
+def worth(config: CommanderConfig, distance: Float[Array, "*n"], success: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The Commander's reward of one env step: whether g* counts as reached, or minus the distance to it.
 
-    Distances alone can deceive in a maze: where `success` counts too, it is what finally matters, and never negative.
+    Distances deceive in a maze, and where they pay, so does waiting at the near side of a wall.
     """
-    if config.reward == "success":
-        return success + config.nearness * jnp.maximum(1 - distance / diameter, 0.0)
-    return -distance
+    return success if config.reward == "success" else -distance
 
 
 def start_reward(config: CommanderConfig) -> float:

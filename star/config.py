@@ -131,6 +131,9 @@ class CommanderConfig(Section):
     epsilon_start: float = Field(0.5, ge=0, le=1, description="share of random targets at the start")
     epsilon_end: float = Field(0.1, ge=0, le=1, description="share of random targets after epsilon_steps")
     epsilon_steps: float = Field(1e6, gt=0, description="env steps over which epsilon falls linearly")
+    epsilon_spread: bool = Field(
+        True, description="spread epsilon over the environments, from none to twice as much, instead of the same in all"
+    )
     hold: bool = Field(True, description="command the goal wherever it counts as reached, whatever the table says")
     practice: float = Field(
         0.25, ge=0, le=1, description="share of environments that practise reaching random regions, one after another"
@@ -142,9 +145,8 @@ class CommanderConfig(Section):
     )
     reward: Literal["success", "mean", "max"] = Field(
         "success",
-        description="of a decision: mean success and nearness of its k env steps, or mean or maximum of r_ext",
+        description="of a decision: mean success of its k env steps, or mean or maximum of r_ext",
     )
-    nearness: float = Field(0.2, ge=0, description="weight in reward success of 1 - distance / diameter of the space")
     sweeps: Positive = Field(10, description="sweeps of value iteration of learner model after every k env steps")
     prior: float = Field(5.0, gt=0, description="decisions that weigh as much as the belief in what was not tried")
     memory: float = Field(0.5, ge=0, le=1, description="share of a decision's weight in the model left an epoch later")

@@ -157,7 +157,7 @@ def command(
     allowed: Successors,
     streams: Streams,
     *,
-    epsilon: Float[Array, ""] | float,
+    epsilon: Float[Array, "B"] | float,
     key: Array,
 ) -> Streams:
     """The Commander's decision, for the streams whose clock is 0."""
@@ -261,7 +261,7 @@ def rollout(
 
     carry = (streams.env, subgoal, 1 - streams.env.done, streams.episode)
     (env_state, _, _, episode), steps = jax.lax.scan(step, carry, jax.random.split(key, config.tutor.period))
-    worth = commander.worth(config.commander, steps.distance, steps.success, spec.diameter)
+    worth = commander.worth(config.commander, steps.distance, steps.success)
     reward = commander.accumulate(config.commander, streams.reward, worth, steps.alive)
     return streams.replace(env=env_state, episode=episode, reward=reward), steps
 

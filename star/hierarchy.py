@@ -95,7 +95,8 @@ def _segment(
     command_key, tutor_key, rollout_key, update_key, reset_key = jax.random.split(key, 5)
     allowed = episode.successors(config, state)
     share = commander.epsilon(config.commander, _env_steps(spec, env, state))
-    streams = episode.command(config, spec, state, allowed, streams, epsilon=share, key=command_key)
+    shares = commander.spread(config.commander, share, num_envs=env.num_envs)
+    streams = episode.command(config, spec, state, allowed, streams, epsilon=shares, key=command_key)
 
     subgoal, tutor_action = episode.choose_subgoal(config, spec, state, streams, deterministic=False, key=tutor_key)
     began = streams.env.obs
@@ -143,10 +144,7 @@ def _command_better(
         believed = regions.adjacent(state.abstraction)
         if config.commander.successors != "all":
             believed = state.graph.reaches | (believed & ~state.graph.misses)
-        centre = regions.centre(state.abstraction)
-        apart = jnp.linalg.norm(centre[:, None] - centre, axis=-1)
-        hoped = commander.worth(config.commander, apart, 0.0, spec.diameter)
-        return commander.plan(config.commander, learnt, allowed, believed=believed, hoped=hoped)
+        return commander.plan(config.commander, learnt, allowed, believed=believed)
 
     period = config.commander.period // config.tutor.period
     return jax.lax.cond(number % period == period - 1, plan, lambda same: same, learnt)

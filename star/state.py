@@ -58,11 +58,6 @@ class Spec:
         """Half-ranges of the Tutor's subgoals."""
         return jnp.asarray(self.subgoal_scale)
 
-    @property
-    def diameter(self) -> float:
-        """The largest distance in the abstract space."""
-        return float(np.linalg.norm(np.subtract(*self.space)))
-
     def state(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch state"]:
         """The state part of an observation."""
         return obs[..., : self.state_dim]

@@ -151,10 +151,6 @@ def test_a_full_table_refuses_every_cut(split):
     jax.tree.map(np.testing.assert_array_equal, full, after)
 
 
-def test_centres_are_midpoints():
-    np.testing.assert_array_equal(regions.centre(grid())[:4], [[2, 2], [2, 14], [14, 2], [14, 14]])
-
-
 def test_inherit_copies_along_each_axis():
     table = np.arange(9.0).reshape(3, 3)
     expected = table.copy()

@@ -89,7 +89,7 @@ def test_periods_with_weight_0_teach_nothing(observe, learner):
     assert all(jax.tree.leaves(jax.tree.map(lambda a, b: (a == b).all(), after, state)))
 
 
-def slow_plan(batch, allowed, believed, hoped, *, discount, prior, sweeps):
+def slow_plan(batch, allowed, believed, *, discount, prior, sweeps):
     """Value iteration from 0 over a model counted decision by decision: for the goals, and to be in their region."""
     q, reach = np.zeros((2, R, R, R))
     led, reward, visits = np.zeros((R, R, R + 1)), np.zeros((R, R, R)), np.zeros((R, R, R))
@@ -111,7 +111,7 @@ def slow_plan(batch, allowed, believed, hoped, *, discount, prior, sweeps):
                 counts = led[i, j].copy()
                 counts[j if believed[i, j] else i] += prior
                 for g in range(R):
-                    r = reward[i, g, j] + prior * (hoped[i, g] + (i == g == j))
+                    r = reward[i, g, j] + prior * (i == g == j)
                     q[i, g, j] = r / (visits[i, g, j] + prior) + discount * counts @ value[:, g] / counts.sum()
                     reach[i, g, j] = (i == g) + discount * counts @ chance[:, g] / counts.sum()
     return q, reach
@@ -123,10 +123,10 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     chosen = settings(learner="model", reward="success", discount=0.9, prior=2.0, sweeps=3)
     _, allowed = random_state(seed)
     batch = random_batch(seed)
-    believed, hoped = rng.random((R, R)) < 0.4, rng.random((R, R)).astype(np.float32)
+    believed = rng.random((R, R)) < 0.4
     state = observe(chosen, commander.init(chosen, regions=R), allowed, batch)
-    planned = jax.jit(commander.plan)(chosen, state, allowed, believed=jnp.array(believed), hoped=jnp.array(hoped))
-    q, reach = slow_plan(batch, np.asarray(allowed.greedy), believed, hoped, discount=0.9, prior=2.0, sweeps=3)
+    planned = jax.jit(commander.plan)(chosen, state, allowed, believed=jnp.array(believed))
+    q, reach = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
     np.testing.assert_allclose(planned.q, q, rtol=1e-5)
     np.testing.assert_allclose(planned.model.reach, reach, rtol=1e-5)
 
@@ -139,8 +139,7 @@ def corridor(batch_of, sweeps=60):
     state = commander.init(chosen, regions=R)
     for batch in batch_of:
         state = commander.observe(chosen, state, everything, batch)
-    none = jnp.zeros((R, R))
-    return commander.plan(chosen, state, everything, believed=jnp.array(neighbours), hoped=none).q
+    return commander.plan(chosen, state, everything, believed=jnp.array(neighbours)).q
 
 
 def many(region, target, next_region, *, count=100, lost=0.0):
@@ -177,17 +176,28 @@ def test_a_decision_fades_by_the_memory_each_epoch():
         np.testing.assert_allclose(getattr(faded.model, name), 0.25 * getattr(state.model, name))
 
 
-def test_success_is_worth_more_than_any_nearness():
-    chosen = settings(reward="success", nearness=0.2)
-    worth = commander.worth(chosen, jnp.array([0.0, 5.0, 50.0, 3.0]), jnp.array([0.0, 0.0, 0.0, 1.0]), 10.0)
-    np.testing.assert_allclose(worth, [0.2, 0.1, 0.0, 1.14], rtol=1e-6)
-    np.testing.assert_allclose(commander.worth(settings(reward="mean"), jnp.array([5.0]), jnp.array([1.0]), 10.0), [-5])
+def test_success_alone_counts_or_distance_alone():
+    distance, success = jnp.array([0.5, 7.0]), jnp.array([1.0, 0.0])
+    np.testing.assert_array_equal(commander.worth(settings(reward="success"), distance, success), [1.0, 0.0])
+    for reward in ("mean", "max"):
+        np.testing.assert_array_equal(commander.worth(settings(reward=reward), distance, success), [-0.5, -7.0])
 
 
 def test_epsilon_falls_linearly_and_stays():
     chosen = settings(epsilon_start=0.9, epsilon_end=0.1, epsilon_steps=1000.0)
     for steps, expected in ((0, 0.9), (250, 0.7), (500, 0.5), (1000, 0.1), (5000, 0.1)):
         np.testing.assert_allclose(commander.epsilon(chosen, jnp.float32(steps)), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 2, 100])
+def test_a_spread_epsilon_is_the_same_on_average_and_differs_between_environments(count):
+    apart = commander.spread(settings(epsilon_spread=True), jnp.float32(0.4), num_envs=count)
+    assert apart.shape == (count,) and len(set(apart.tolist())) == count and 0 < apart.min()
+    np.testing.assert_allclose(apart.mean(), 0.4, rtol=1e-5)
+    assert count < 100 or (apart.min() < 0.01 and apart.max() > 0.79)
+    np.testing.assert_allclose(
+        commander.spread(settings(epsilon_spread=False), jnp.float32(0.4), num_envs=count), [0.4] * count, rtol=1e-6
+    )
 
 
 # Regions 0-3 are active, 4 is not. 0 is known to reach 1; 2 is shown unreachable from 0 and 1, as 3 is from itself.

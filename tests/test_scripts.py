@@ -1,5 +1,6 @@
 import argparse
 import importlib.util
+import json
 from pathlib import Path
 
 import jax
@@ -98,6 +99,31 @@ def test_agents_and_ablations_are_found_and_others_refused():
     assert script.layer("grid") == ["--with", "configs/ablations/grid.yaml"]
     with pytest.raises(SystemExit, match="hirro: no such agent; known are star, "):
         script.layer("hirro")
+
+
+@pytest.mark.parametrize(("flags", "programs"), [((), [[0, 1], [2, 3]]), (("--one-by-one",), [[0], [1], [2], [3]])])
+def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatch, flags, programs):
+    script, trained = load("reproduce"), []
+
+    def measure(task, name, seeds, options, settings):
+        trained.append(seeds)
+        row = {"env_steps": 500, "wall_s": 9.0, "env_steps_per_s": 100.0 * len(seeds), "eval/success_any": 0.9}
+        return {
+            "rows": [row | {"seed": seed} for seed in seeds],
+            "evaluated": [{"seed": seed, "success_any": 1.0, "success_final": seed / 4} for seed in seeds],
+            "run": {"seeds": seeds, "command": f"star train {settings}"},
+        }
+
+    monkeypatch.setattr(script, "measure", measure)
+    for count in (2, 4):
+        script.main(["point_maze", "star", "--seeds", str(count), "--out", str(tmp_path), *flags, "--", "--quick"])
+    assert trained == programs
+    kept = json.loads((tmp_path / "star.json").read_text(encoding="utf-8"))
+    assert [seed["seed"] for seed in kept["seeds"]] == [0, 1, 2, 3]
+    assert [run["seeds"] for run in kept["runs"]] == programs
+    assert {seed["training_seconds_to_level"] for seed in kept["seeds"]} == {5.0}
+    assert "| star | 4 | 0.0 M | 1.00 [1.00, 1.00] | 0.38 [" in (tmp_path / "table.md").read_text(encoding="utf-8")
+    assert len((tmp_path / "curves.jsonl").read_text(encoding="utf-8").splitlines()) == 4
 
 
 def test_curves_are_drawn(tmp_path):
