@@ -7,9 +7,8 @@ qpos is x, y, z in m, a unit quaternion (w, x, y, z), then hip and ankle of legs
 of the torso in m/s (world frame), its angular velocity in rad/s (body frame), then the 8 joint velocities. Actions
 follow the order of the joints, 1 standing for 30 N m.
 
-With the abstract dimensions `pose`, cosine and sine of the yaw follow. What the task holds beside the ant is hidden
-from this state. The full one appends, for each block, how far it has slid along each of its axes and how fast, then 1
-for each gate that is open.
+What the task holds beside the ant is hidden from this state. The full one appends, for each block, how far it has
+slid along each of its axes and how fast, then 1 for each gate that is open.
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ START_POSITION = 0.1  # half-range of the start qpos, m and rad
 START_SPEED = 0.1  # standard deviation of the start qvel, m/s and rad/s
 STEP_SCALE = 0.001  # of the step count in the state
 QPOS, QVEL = 15, 14  # the ant's own positions and velocities; those of blocks follow
-HEADING = QPOS + QVEL + 1  # index of the yaw's cosine and then sine in a state that has them
 ON_ITS_BACK = -0.5  # the ant is flipped when the vertical part of its own up axis is below
 LIFT = 2 * HEIGHT  # how far an open gate is lifted, m
 
@@ -72,21 +70,13 @@ def build(task: Task, engine: str, options: Mapping[str, Any]) -> Ant:
     }
     body = spec(action_scale=chosen["action_scale"], collisions=chosen["collisions"])
     physics = Physics(scene.build_model(task.arena, body, solver), engine=engine, frames=chosen["frames"])
-    return Ant(
-        physics,
-        task,
-        action_scale=chosen["action_scale"],
-        heading=chosen["abstract"] == "pose",
-        full=chosen["observe"] == "full",
-    )
+    return Ant(physics, task, action_scale=chosen["action_scale"], full=chosen["observe"] == "full")
 
 
 class Ant:
-    """The body for `MazeEnv`: state of 30, two more with `heading`, more if `full`; 8 actions."""
+    """The body for `MazeEnv`: state of 30, more if `full`; 8 actions."""
 
-    def __init__(
-        self, physics: Physics, task: Task, *, action_scale: float = 1.0, heading: bool = False, full: bool = False
-    ):
+    def __init__(self, physics: Physics, task: Task, *, action_scale: float = 1.0, full: bool = False):
         """Live in the model of `physics`, whose first 15 qpos, 14 qvel and 8 controls are the ant's."""
         self.physics = physics
         self.action_size = physics.model.nu
@@ -94,7 +84,6 @@ class Ant:
         self._arena = task.arena
         self._switch: Switch | None = task.switch
         self._block_noise = task.block_noise
-        self._heading = heading
         self._full = full
         self._max_torque = MAX_TORQUE * action_scale
         self._closed = np.asarray(physics.mocap_pos)
@@ -103,7 +92,7 @@ class Ant:
         start[2] += task.arena.floor_height
         self._start = start.astype(np.float32)
         slides = 2 * (len(start) - QPOS)
-        self.state_dim = HEADING + 2 * heading + (slides + len(self._closed)) * full
+        self.state_dim = QPOS + QVEL + 1 + (slides + len(self._closed)) * full
 
     @property
     def engine(self) -> str:
@@ -133,13 +122,9 @@ class Ant:
     def observe(self, data: PhysicsState, steps: jax.Array) -> jax.Array:
         """The state [state_dim]."""
         clock = STEP_SCALE * steps.astype(jnp.float32)
-        seen = [data.qpos[:QPOS], data.qvel[:QVEL], clock[None]]
-        if self._heading:
-            yaw = _yaw(data.qpos[3:7])
-            seen.append(jnp.stack([jnp.cos(yaw), jnp.sin(yaw)]))
-        if self._full:
-            seen += [data.qpos[QPOS:], data.qvel[QVEL:], self._is_open(data).astype(jnp.float32)]
-        return jnp.concatenate(seen)
+        published = [data.qpos[:QPOS], data.qvel[:QVEL], clock[None]]
+        hidden = [data.qpos[QPOS:], data.qvel[QVEL:], self._is_open(data).astype(jnp.float32)]
+        return jnp.concatenate(published + hidden if self._full else published)
 
     def displace(self, data: PhysicsState, offset: jax.Array) -> PhysicsState:
         """The ant moved by `offset` [2]; the solver corrects what gets into a wall."""
@@ -167,11 +152,6 @@ class Ant:
 
     def _at_switch(self, data: PhysicsState) -> jax.Array:
         assert self._switch is not None
-        yaw = _yaw(data.qpos[3:7])
-        return self._switch.holds(data.qpos[:2]) & (self._switch.yaw[0] <= yaw) & (yaw <= self._switch.yaw[1])
-
-
-def _yaw(quaternion: jax.Array) -> jax.Array:
-    """Angle about z, in rad, of the unit quaternion [4] (w, x, y, z)."""
-    w, x, y, z = quaternion
-    return jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
+        x, y, _, w, i, j, k = data.qpos[:7]
+        yaw = jnp.arctan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j**2 + k**2))
+        return self._switch.holds(jnp.stack([x, y])) & (self._switch.yaw[0] <= yaw) & (yaw <= self._switch.yaw[1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 from envs import ant, point, tasks
@@ -38,8 +37,6 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
                 raise EnvError(f'option "{key}" of a map is {chosen[key]!r}; allowed: {", ".join(sets)}')
     elif chosen["cell"] is not None:
         task = task.resized(chosen["cell"])
-    if chosen.get("abstract") == "pose":
-        task = replace(task, geometry=task.geometry.with_heading(ant.HEADING))
     radius = chosen["success_radius"]
     return MazeEnv(
         name,

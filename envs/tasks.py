@@ -64,17 +64,6 @@ class Geometry:
     region_cuts: tuple[Point, ...]
     subgoal_scale: Point
 
-    def with_heading(self, cosine: int) -> Geometry:
-        """The same with cosine and sine of the yaw, at index `cosine` and the next, as two more abstract dimensions."""
-        lower, upper = self.space
-        return replace(
-            self,
-            abstract_indices=(*self.abstract_indices, cosine, cosine + 1),
-            space=((*lower, -1.0, -1.0), (*upper, 1.0, 1.0)),
-            region_cuts=(*self.region_cuts, (), ()),
-            subgoal_scale=(*self.subgoal_scale, 1.0, 1.0),
-        )
-
     def resized(self, ratio: float) -> Geometry:
         """The same geometry at `ratio` times the size in x and y."""
         lower, upper = self.space
@@ -176,7 +165,6 @@ COMMON: Mapping[str, Option] = {
 }
 
 ANT: Mapping[str, Option] = {
-    "abstract": choice("position", "pose"),
     "flip": choice("ignore", "terminate", "truncate"),
     "preset": choice(*PRESETS),
     "collisions": choice("all", "feet"),

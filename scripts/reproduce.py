@@ -37,6 +37,7 @@ from scipy import stats
 ROOT = Path(__file__).parents[1]
 AGENTS = ("star", "hiro", "hrac", "gara", "flat", "flat_td3")
 LEVEL = 0.9  # of success_any, for the time to it
+CURVE = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
 STAR = (sys.executable, "-m", "star.cli")
 _DEVICE = "import jax; d = jax.devices()[0]; print(d.device_kind if d.platform == 'gpu' else 'CPU')"
 
@@ -54,19 +55,18 @@ def layer(name: str) -> list[str]:
 
 
 def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace, settings: list[str]) -> dict[str, Any]:
-    """Train and evaluate `seeds` of one agent in one program: its metrics, their evaluation, and how it was run."""
-    run = options.runs / task / f"{name}-{seeds[0]}"
+    """Train and evaluate the consecutive `seeds` of one agent in one program: metrics, evaluation, how it was run."""
+    run = options.runs / task / "-".join([name, *map(str, seeds)])
     chosen = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), *settings]
     train = ["train", f"configs/{task}.yaml", *layer(name), *chosen]
     if (run / "checkpoints").exists():  # interrupted, or done
         subprocess.run([*STAR, "train", "--resume", str(run)], cwd=ROOT, check=True)
     else:
         subprocess.run([*STAR, *train, "--run-dir", str(run)], cwd=ROOT, check=True)
-    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text(encoding="utf-8").splitlines()]
     evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--json"]
     report = subprocess.run(evaluate, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     return {
-        "rows": rows,
+        "rows": lines(run / "metrics.jsonl"),
         "evaluated": json.loads(report.splitlines()[-1])["seeds"],
         "run": {"seeds": seeds, "command": shlex.join(["star", *train])} | provenance(options.commit),
     }
@@ -75,8 +75,7 @@ def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace,
 def summarise(task: str, name: str, old: dict[str, Any], measured: dict[str, Any]) -> tuple[dict[str, Any], list]:
     """What goes into an agent's JSON, the seeds of the `old` one included, and the new evaluations during training."""
     rows = measured["rows"]
-    keys = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
-    curve = [{"name": name} | {k: row[k] for k in keys if k in row} for row in rows if "eval/success_any" in row]
+    curve = [{"name": name} | {k: row[k] for k in CURVE if k in row} for row in rows if "eval/success_any" in row]
     speed = float(np.median([row["env_steps_per_s"] for row in rows]))  # of the seeds of a program together
     for seed in measured["evaluated"]:
         first = next((p for p in curve if p["seed"] == seed["seed"] and p["eval/success_any"] >= LEVEL), None)
@@ -88,10 +87,21 @@ def summarise(task: str, name: str, old: dict[str, Any], measured: dict[str, Any
     return {
         "task": task,
         "name": name,
-        "env_steps_per_seed": max(row["env_steps"] for row in rows),
+        "env_steps_per_seed": rows[-1]["env_steps"],
         "seeds": [*old.get("seeds", []), *measured["evaluated"]],
         "runs": [*old.get("runs", []), measured["run"] | {"env_steps_per_s": speed}],
     }, curve
+
+
+def groups(missing: list[int], *, one_by_one: bool) -> list[list[int]]:
+    """The `missing` seeds by the program that trains them: alone, or with all that follow one another."""
+    found: list[list[int]] = []
+    for seed in missing:
+        if found and not one_by_one and seed == found[-1][-1] + 1:
+            found[-1].append(seed)
+        else:
+            found.append([seed])
+    return found
 
 
 def provenance(commit: str | None) -> dict[str, Any]:
@@ -176,6 +186,11 @@ def draw(curves: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
+def lines(path: Path) -> list[dict[str, Any]]:
+    """What a file of JSON lines holds; nothing if there is none."""
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Fill the folder of one task."""
     parser = argparse.ArgumentParser(
@@ -205,16 +220,17 @@ def main(arguments: list[str] | None = None) -> None:
         path = out / f"{name}.json"
         report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         missing = sorted(set(range(options.seeds)) - {seed["seed"] for seed in report.get("seeds", [])})
-        for seeds in [[seed] for seed in missing] if options.one_by_one else [missing] * bool(missing):
+        for seeds in groups(missing, one_by_one=options.one_by_one):
             measured = measure(options.task, name, seeds, options, settings)
             report, curve = summarise(options.task, name, report, measured)
-            with record.open("a", encoding="utf-8") as file:
-                file.writelines(json.dumps(point) + "\n" for point in curve)
+            kept = [point for point in lines(record) if point["name"] != name or point["seed"] not in seeds] + curve
+            record.write_text("".join(json.dumps(point) + "\n" for point in kept), encoding="utf-8")
             path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    reports = [json.loads(path.read_text(encoding="utf-8")) for path in sorted(out.glob("*.json"))]
+    paths = [out / f"{name}.json" for name in dict.fromkeys(point["name"] for point in lines(record))]
+    reports = [json.loads(path.read_text(encoding="utf-8")) for path in paths if path.exists()]
     reports.sort(key=lambda report: (report["name"] != "star", report["name"]))
     (out / "table.md").write_text(table(reports), encoding="utf-8")
-    draw([json.loads(line) for line in record.read_text(encoding="utf-8").splitlines()], out / "curves.png")
+    draw(lines(record), out / "curves.png")
     print(table(reports))
 
 

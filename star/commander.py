@@ -130,11 +130,11 @@ def epsilon(config: CommanderConfig, env_steps: Float[Array, ""]) -> Float[Array
 def spread(config: CommanderConfig, share: Float[Array, ""], *, num_envs: int) -> Float[Array, "B"]:
     """Share of random choices of each environment, `share` on average.
 
-    Spread from none to twice as much, some environments walk a long way to its end while others leave it often (as in
-    Ape-X, Horgan et al. 2018).
+    Spread from none to twice as much (or as evenly around `share` as shares allow), some environments walk a long way
+    to its end while others leave it often (as in Ape-X, Horgan et al. 2018).
     """
-    even = (jnp.arange(num_envs) + 0.5) * (2 / num_envs)
-    return share * (even if config.epsilon_spread else jnp.ones(num_envs))
+    even = (2 * jnp.arange(num_envs) + 1) / num_envs - 1
+    return share + config.epsilon_spread * even * jnp.minimum(share, 1 - share)
 
 
 def practice(config: CommanderConfig) -> Float[Array, ""] | float:

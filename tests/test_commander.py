@@ -190,14 +190,14 @@ def test_epsilon_falls_linearly_and_stays():
 
 
 @pytest.mark.parametrize("count", [1, 2, 100])
-def test_a_spread_epsilon_is_the_same_on_average_and_differs_between_environments(count):
-    apart = commander.spread(settings(epsilon_spread=True), jnp.float32(0.4), num_envs=count)
-    assert apart.shape == (count,) and len(set(apart.tolist())) == count and 0 < apart.min()
-    np.testing.assert_allclose(apart.mean(), 0.4, rtol=1e-5)
-    assert count < 100 or (apart.min() < 0.01 and apart.max() > 0.79)
-    np.testing.assert_allclose(
-        commander.spread(settings(epsilon_spread=False), jnp.float32(0.4), num_envs=count), [0.4] * count, rtol=1e-6
-    )
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
+def test_a_spread_epsilon_is_the_same_on_average_and_differs_between_environments(count, share):
+    apart = commander.spread(settings(epsilon_spread=True), jnp.float32(share), num_envs=count)
+    assert apart.shape == (count,) and len(set(apart.tolist())) == count and 0 <= apart.min() and apart.max() <= 1
+    np.testing.assert_allclose(apart.mean(), share, rtol=1e-5)
+    assert count < 100 or share > 0.5 or (apart.min() < 0.02 * share and apart.max() > 1.98 * share)
+    same = commander.spread(settings(epsilon_spread=False), jnp.float32(share), num_envs=count)
+    np.testing.assert_allclose(same, [share] * count, rtol=1e-6)
 
 
 # Regions 0-3 are active, 4 is not. 0 is known to reach 1; 2 is shown unreachable from 0 and 1, as 3 is from itself.

@@ -101,29 +101,52 @@ def test_agents_and_ablations_are_found_and_others_refused():
         script.layer("hirro")
 
 
-@pytest.mark.parametrize(("flags", "programs"), [((), [[0, 1], [2, 3]]), (("--one-by-one",), [[0], [1], [2], [3]])])
-def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatch, flags, programs):
+def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatch):
+    """A stand-in for `star` writes metrics and reports the seeds that its run was trained with."""
     script, trained = load("reproduce"), []
 
-    def measure(task, name, seeds, options, settings):
-        trained.append(seeds)
-        row = {"env_steps": 500, "wall_s": 9.0, "env_steps_per_s": 100.0 * len(seeds), "eval/success_any": 0.9}
-        return {
-            "rows": [row | {"seed": seed} for seed in seeds],
-            "evaluated": [{"seed": seed, "success_any": 1.0, "success_final": seed / 4} for seed in seeds],
-            "run": {"seeds": seeds, "command": f"star train {settings}"},
-        }
+    def run(command, **kwargs):
+        if "git" in command or "-c" in command:
+            return argparse.Namespace(stdout="")
+        _, _, _, verb, *rest = command
+        if verb == "train":
+            folder, count = Path(rest[rest.index("--run-dir") + 1]), int(rest[rest.index("--seeds") + 1])
+            seeds = [int(rest[rest.index("--seed") + 1]) + i for i in range(count)]
+            trained.append(seeds)
+            row = {"env_steps": 500, "wall_s": 9.0, "env_steps_per_s": 100.0 * count, "eval/success_any": 0.9}
+            (folder / "checkpoints").mkdir(parents=True)
+            rows = "".join(json.dumps(row | {"seed": seed}) + "\n" for seed in seeds)
+            (folder / "metrics.jsonl").write_text(rows, encoding="utf-8")
+            return None
+        seeds = [json.loads(line)["seed"] for line in (Path(rest[0]) / "metrics.jsonl").read_text().splitlines()]
+        report = {"seeds": [{"seed": seed, "success_any": 1.0, "success_final": seed / 4} for seed in seeds]}
+        return argparse.Namespace(stdout=json.dumps(report) + "\n")
 
-    monkeypatch.setattr(script, "measure", measure)
-    for count in (2, 4):
-        script.main(["point_maze", "star", "--seeds", str(count), "--out", str(tmp_path), *flags, "--", "--quick"])
-    assert trained == programs
-    kept = json.loads((tmp_path / "star.json").read_text(encoding="utf-8"))
-    assert [seed["seed"] for seed in kept["seeds"]] == [0, 1, 2, 3]
-    assert [run["seeds"] for run in kept["runs"]] == programs
+    monkeypatch.setattr(script.subprocess, "run", run)
+    common = ["--runs", str(tmp_path / "runs"), "--commit", "c0ffee"]
+    for seeds, flags, out in ((2, (), "a"), (5, (), "a"), (2, ("--one-by-one",), "b"), (2, ("--one-by-one",), "b")):
+        folder = tmp_path / out
+        script.main(["point_maze", "star", "--seeds", str(seeds), "--out", str(folder), *common, *flags])
+    assert trained == [[0, 1], [2, 3, 4], [0], [1]]
+    kept = json.loads((tmp_path / "a" / "star.json").read_text(encoding="utf-8"))
+    assert [seed["seed"] for seed in kept["seeds"]] == [0, 1, 2, 3, 4]
+    assert [(program["seeds"], program["commit"]) for program in kept["runs"]] == [
+        ([0, 1], "c0ffee"),
+        ([2, 3, 4], "c0ffee"),
+    ]
     assert {seed["training_seconds_to_level"] for seed in kept["seeds"]} == {5.0}
-    assert "| star | 4 | 0.0 M | 1.00 [1.00, 1.00] | 0.38 [" in (tmp_path / "table.md").read_text(encoding="utf-8")
-    assert len((tmp_path / "curves.jsonl").read_text(encoding="utf-8").splitlines()) == 4
+    assert "| star | 5 | 0.0 M | 1.00 [1.00, 1.00] | 0.50 [" in (tmp_path / "a" / "table.md").read_text()
+    (tmp_path / "a" / "star.json").unlink()
+    (tmp_path / "a" / "notes.json").write_text("not a report", encoding="utf-8")
+    script.main(["point_maze", "star", "--out", str(tmp_path / "a"), "--runs", str(tmp_path / "others")])
+    assert len((tmp_path / "a" / "curves.jsonl").read_text().splitlines()) == 5
+
+
+def test_seeds_that_follow_one_another_share_a_program():
+    groups = load("reproduce").groups
+    assert groups([0, 1, 4, 5, 7], one_by_one=False) == [[0, 1], [4, 5], [7]]
+    assert groups([0, 1, 4], one_by_one=True) == [[0], [1], [4]]
+    assert groups([], one_by_one=False) == []
 
 
 def test_curves_are_drawn(tmp_path):

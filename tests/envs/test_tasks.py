@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.spatial.transform import Rotation
 
 import envs
 from envs import maze
@@ -221,22 +220,6 @@ def test_the_full_observation_appends_what_is_hidden(name, extra):
     np.testing.assert_array_equal(hidden, np.concatenate([data.qpos[15:], data.qvel[14:], flag]))
     plain = envs.make(name, engine="native").reset(jax.random.key(0))
     np.testing.assert_array_equal(plain.obs[:30], state.obs[:30])
-
-
-def test_pose_adds_the_heading_to_the_state_and_to_the_abstract_dimensions():
-    env = envs.make("ant_maze_cam", engine="native", abstract="pose", observe="full")
-    plain = envs.make("ant_maze_cam", engine="native", observe="full")
-    assert (env.state_dim, env.abstract_indices) == (33, (0, 1, 30, 31))
-    np.testing.assert_array_equal(env.space, [[-4, -4, -1, -1], [20, 20, 1, 1]])
-    assert env.region_cuts == (*plain.region_cuts, (), ()) and env.subgoal_scale == (*plain.subgoal_scale, 1.0, 1.0)
-    data = env.reset(jax.random.key(0)).pipeline_state.data
-    for yaw in (-2.0, -0.5, 0.0, 3.0):
-        roll = Rotation.from_euler("ZYX", [yaw, 0.3, -0.4]).as_quat(scalar_first=True)
-        turned = data.replace(qpos=data.qpos.at[3:7].set(roll))
-        state = env.body.observe(turned, jnp.int32(0))
-        np.testing.assert_allclose(state[30:32], [np.cos(yaw), np.sin(yaw)], atol=1e-5)
-        without = plain.body.observe(turned, jnp.int32(0))
-        np.testing.assert_array_equal(jnp.concatenate([state[:30], state[32:]]), without)
 
 
 def test_the_block_of_the_stochastic_maze_starts_elsewhere_every_time():
