@@ -115,7 +115,7 @@ def test_settings_named_on_a_page_exist(page):
     for code in inline(PAGES[page]):
         named = re.fullmatch(pattern, code.split(" ")[0])
         if named and not named[1].endswith(".py"):
-            assert named[1] in known or named[1].startswith("env.options."), code
+            assert named[1] in known or named[1].startswith(("env.options.", "env.training.")), code
 
 
 def test_the_list_of_settings_is_what_the_command_prints(capsys):
