@@ -108,7 +108,7 @@ def test_jaxgcrl_mazes_keep_their_first_index_as_x():
 def test_cells_of_another_size_scale_x_and_y_and_leave_heights():
     env = envs.make("ant_fall", engine="native", cell=4.0, goals="test")
     assert [corner.tolist() for corner in env.space] == [[-2.0, -2.0, 0.0], [6.0, 14.0, 8.0]]
-    assert env.region_cuts == ((2.0,), (6.0,), ()) and env.subgoal_scale == (5.0, 5.0, 0.5)
+    assert env.region_cuts == ((2.0,), (8.0,), ()) and env.subgoal_scale == (5.0, 5.0, 0.5)
     assert env.reset(jax.random.key(0)).obs[-3:].tolist() == [0.0, 13.5, 4.5]
     assert (env.arena.floor_height, env.success_radius) == (4.0, 2.5)
     assert TASKS["ant_maze_stochastic"].resized(2.0).block_noise == 0.25
