@@ -34,6 +34,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
+from star.metrics import JsonLines
+
 ROOT = Path(__file__).parents[1]
 AGENTS = ("star", "hiro", "hrac", "gara", "flat", "flat_td3")
 LEVEL = 0.9  # of success_any, for the time to it
@@ -66,7 +68,7 @@ def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace,
     evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--json"]
     report = subprocess.run(evaluate, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     return {
-        "rows": lines(run / "metrics.jsonl"),
+        "rows": JsonLines(run / "metrics.jsonl").read(),
         "evaluated": json.loads(report.splitlines()[-1])["seeds"],
         "run": {"seeds": seeds, "command": shlex.join(["star", *train])} | provenance(options.commit),
     }
@@ -186,11 +188,6 @@ def draw(curves: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
-def lines(path: Path) -> list[dict[str, Any]]:
-    """What a file of JSON lines holds; nothing if there is none."""
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Fill the folder of one task."""
     parser = argparse.ArgumentParser(
@@ -215,7 +212,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     out = options.out or ROOT / "results" / options.task / ("one_by_one" if options.one_by_one else "")
     out.mkdir(parents=True, exist_ok=True)
-    record = out / "curves.jsonl"
+    record = JsonLines(out / "curves.jsonl")
     for name in options.names:
         path = out / f"{name}.json"
         report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -223,14 +220,15 @@ def main(arguments: list[str] | None = None) -> None:
         for seeds in groups(missing, one_by_one=options.one_by_one):
             measured = measure(options.task, name, seeds, options, settings)
             report, curve = summarise(options.task, name, report, measured)
-            kept = [point for point in lines(record) if point["name"] != name or point["seed"] not in seeds] + curve
-            record.write_text("".join(json.dumps(point) + "\n" for point in kept), encoding="utf-8")
+            kept = [point for point in record.read() if point["name"] != name or point["seed"] not in seeds] + curve
+            record.path.write_text("".join(json.dumps(point) + "\n" for point in kept), encoding="utf-8")
             path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
-    paths = [out / f"{name}.json" for name in dict.fromkeys(point["name"] for point in lines(record))]
+    curves = record.read()
+    paths = [out / f"{name}.json" for name in dict.fromkeys(point["name"] for point in curves)]
     reports = [json.loads(path.read_text(encoding="utf-8")) for path in paths if path.exists()]
     reports.sort(key=lambda report: (report["name"] != "star", report["name"]))
     (out / "table.md").write_text(table(reports), encoding="utf-8")
-    draw(lines(record), out / "curves.png")
+    draw(curves, out / "curves.png")
     print(table(reports))
 
 
