@@ -29,6 +29,8 @@ class Body(Protocol):
 
     state_dim: int
     action_size: int
+    orientation: tuple[int, ...]
+    """Where in the state the unit quaternion (w, x, y, z) of the body is; empty if it has none."""
     dt: float
 
     @property
@@ -98,6 +100,7 @@ class MazeEnv(Env):
         self.arena: Arena = task.arena
         self.episode_length = episode_length
         self.state_dim = body.state_dim
+        self.orientation = body.orientation
         self.dt = body.dt
         self.success_radius = success_radius
         geometry = task.geometry

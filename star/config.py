@@ -189,6 +189,9 @@ class TutorConfig(LevelConfig):
 
     enabled: bool = Field(True, description="false gives the target box to the Controller itself, as in GARA")
     period: Positive = Field(10, description="l: env steps between the Tutor's decisions")
+    heading: float = Field(
+        0.0, ge=0, description="m: subgoals also say where to face, by a vector of this length; 0: they do not"
+    )
     unroll: Positive = Field(5, description="decisions of each environment per update")
     reward_scale: float = Field(0.3, gt=0, description="factor on the reward")
     relative_bounds: bool = Field(True, description="observe the region's bounds relative to the agent")

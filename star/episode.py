@@ -240,7 +240,7 @@ def rollout(
         seen = controller.observe(spec.state(obs), subgoal, position=spec.abstract_indices)
         action = learner.act(config.controller, state.controller, seen, deterministic=deterministic, key=step_key)
         env_state = env.step(env_state, action)
-        after = controller.next_subgoal(subgoal, spec.abstract(obs), spec.abstract(env_state.obs))
+        after = controller.next_subgoal(subgoal, spec.pose(obs), spec.pose(env_state.obs))
         steps = Steps(
             obs=obs,
             next_obs=env_state.obs,

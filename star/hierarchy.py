@@ -207,7 +207,7 @@ def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transi
     return Transition(
         obs=observe(spec.state(steps.obs), steps.subgoal),
         action=steps.action,
-        reward=controller.reward(config.controller, steps.subgoal, steps.next_subgoal, size=len(spec.abstract_indices))
+        reward=controller.reward(config.controller, steps.subgoal, steps.next_subgoal, size=len(spec.scale))
         - config.controller.termination_penalty * steps.terminated,
         next_obs=observe(spec.state(steps.next_obs), steps.next_subgoal),
         terminated=steps.terminated,
@@ -219,13 +219,13 @@ def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transi
 
 def _later(spec: Spec, steps: Steps) -> Float[Array, "l B 2 d"]:
     """Where the agent was at the end of the segment, seen from before and from after each of its env steps."""
-    before, after = spec.abstract(steps.obs), spec.abstract(steps.next_obs)
+    before, after = spec.pose(steps.obs), spec.pose(steps.next_obs)
     return jnp.stack([after[-1] - before, after[-1] - after], axis=-2)
 
 
 def _in_hindsight(config: AgentConfig, spec: Spec, batch: Transition, key: Array) -> Transition:
     """Half of the replayed transitions as if what the agent reached had been its subgoal (Andrychowicz et al. 2017)."""
-    d = len(spec.abstract_indices)
+    d = len(spec.scale)
     size = d if config.tutor.enabled else 2 * d
     margin = config.commander.goal_margin
     reached = batch.extras
@@ -251,8 +251,8 @@ def _tutor_transition(
     """The Tutor's decision at `began`; `streams` stand at the end of its segment, still under its target box."""
     observe = partial(tutor.observe, config.tutor)
     path = jnp.concatenate([began[None], steps.next_obs])
-    achieved = spec.abstract(path)
-    distances = jnp.linalg.norm(achieved - streams.box.centre, axis=-1)
+    achieved = spec.pose(path)
+    distances = jnp.linalg.norm(spec.abstract(path) - streams.box.centre, axis=-1)
     terminated, ended = (jnp.max(flag * steps.alive, axis=0) for flag in (steps.terminated, steps.ended))
     extras: Any = achieved[0] if config.tutor.adjacency.enabled else ()
     if config.tutor.off_policy_correction:
@@ -319,7 +319,8 @@ def _penalty(config: AgentConfig, spec: Spec, state: TrainState) -> Penalty:
 
     def price(batch: Transition, action: Array) -> Array:
         start = batch.extras.achieved[..., 0, :] if config.tutor.off_policy_correction else batch.extras
-        return adjacency.penalty(config.tutor.adjacency, known, start, action * spec.scale)
+        d = len(spec.abstract_indices)
+        return adjacency.penalty(config.tutor.adjacency, known, start[..., :d], (action * spec.scale)[..., :d])
 
     return price
 

@@ -37,9 +37,13 @@ class Spec:
     space: tuple[tuple[float, ...], tuple[float, ...]]
     region_cuts: tuple[tuple[float, ...], ...]
     success_radius: float
+    orientation: tuple[int, ...] = ()
+    """Indices of the body's unit quaternion (w, x, y, z) in the state; empty if it has none."""
+    heading: float = 0.0
+    """Length, in m, of the heading vector that subgoals set too; 0 if they do not."""
 
     @classmethod
-    def of(cls, env: Any) -> Spec:
+    def of(cls, env: Any, *, heading: float = 0.0) -> Spec:
         """Read the spec off an environment of `envs.make`."""
         return cls(
             state_dim=env.state_dim,
@@ -51,12 +55,14 @@ class Spec:
             space=(tuple(map(float, env.space[0])), tuple(map(float, env.space[1]))),
             region_cuts=tuple(tuple(cut) for cut in env.region_cuts),
             success_radius=float(env.success_radius),
+            orientation=tuple(env.orientation),
+            heading=heading,
         )
 
     @property
-    def scale(self) -> Float[Array, "d"]:
+    def scale(self) -> Float[Array, "p"]:
         """Half-ranges of the Tutor's subgoals."""
-        return jnp.asarray(self.subgoal_scale)
+        return jnp.asarray(self.subgoal_scale + (self.heading,) * (2 if self.heading else 0))
 
     def state(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch state"]:
         """The state part of an observation."""
@@ -69,6 +75,18 @@ class Spec:
     def abstract(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch d"]:
         """The abstract dimensions of an observation."""
         return obs[..., np.asarray(self.abstract_indices)]
+
+    def pose(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch p"]:
+        """What subgoals are about: the abstract dimensions, and with a `heading` the vector of that length ahead.
+
+        The latter is (cos, sin) of the yaw, the angle about z, times the length: in the same unit as positions.
+        """
+        if not self.heading:
+            return self.abstract(obs)
+        w, x, y, z = (obs[..., i] for i in self.orientation)
+        yaw = jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
+        ahead = self.heading * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
+        return jnp.concatenate([self.abstract(obs), ahead], axis=-1)
 
     def goal_point(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch d"]:
         """g* as an abstract point; abstract dimensions that g* leaves open are those of the state."""
@@ -133,6 +151,8 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(f"tutor.unroll: {config.tutor.unroll} does not divide the {segments} decisions of an episode")
     if config.commander.period > spec.episode_length:
         raise ValueError(f"commander.period: {config.commander.period} exceeds the episode of {spec.episode_length}")
+    if config.tutor.heading and not spec.orientation:
+        raise ValueError(f"tutor.heading: {config.tutor.heading:g}, but the body has no orientation; allowed: 0")
     cells = int(np.prod(adjacency.shape(config.tutor.adjacency, spec.space)))
     if config.tutor.adjacency.enabled and cells > adjacency.MAX_CELLS:
         raise ValueError(
@@ -155,28 +175,28 @@ def check(config: Config, spec: Spec) -> None:
 
 def _examples(config: AgentConfig, spec: Spec) -> tuple[Transition, Transition]:
     """Shapes of one transition of Tutor and Controller."""
-    d, l, scalar = len(spec.abstract_indices), config.tutor.period, jnp.zeros(())
+    d, p, l, scalar = len(spec.abstract_indices), len(spec.scale), config.tutor.period, jnp.zeros(())
     rest = {"reward": scalar, "terminated": scalar, "cut": scalar, "weight": scalar}
     seen_by_tutor = jnp.zeros(spec.state_dim + 2 * d)
     extras: Any = ()
     if config.tutor.adjacency.enabled:
-        extras = jnp.zeros(d)
+        extras = jnp.zeros(p)
     trace = Trace(
         states=jnp.zeros((l, spec.state_dim)),
         actions=jnp.zeros((l, spec.action_size)),
-        achieved=jnp.zeros((l + 1, d)),
+        achieved=jnp.zeros((l + 1, p)),
     )
     if config.tutor.off_policy_correction:
         extras = trace
-    subgoal = jnp.zeros(d if config.tutor.enabled else 2 * d)
+    subgoal = jnp.zeros(p if config.tutor.enabled else 2 * d)
     seen_by_controller = controller.observe(jnp.zeros(spec.state_dim), subgoal, position=spec.abstract_indices)
     return (
-        Transition(obs=seen_by_tutor, action=jnp.zeros(d), next_obs=seen_by_tutor, extras=extras, **rest),
+        Transition(obs=seen_by_tutor, action=jnp.zeros(p), next_obs=seen_by_tutor, extras=extras, **rest),
         Transition(
             obs=seen_by_controller,
             action=jnp.zeros(spec.action_size),
             next_obs=seen_by_controller,
-            extras=jnp.zeros((2, d)) if config.controller.hindsight else (),
+            extras=jnp.zeros((2, p)) if config.controller.hindsight else (),
             **rest,
         ),
     )
