@@ -1,0 +1,371 @@
+"""Which region of goals to practise, with which strategy: where competence grows most for what it costs.
+
+    progress of region r        P_r  = mean competence of the newer half of its window - that of the older half
+    progress by strategy s      P_rs = what a block of episodes with s adds to the competence of r
+    interest                    I_rs = max(P_rs, 0) / cost_s
+    choice                      region ~ max(P_r, 0), then strategy ~ I_rs ^ sharpness; a share of both is random
+
+A block is what one call of `update` is told: a few episodes of one learner in a row, or an epoch of many environments.
+With m_b the mean competence in the b-th block that region r has a part in, and x_bs the share of strategy s in it,
+
+    m_b - m_(b-1)  =  sum over s of f_s P_rs,        f = (x_(b-1) + x_b) / 2,
+
+as a block's mean stands for its middle: half of what is learnt between two middles is due to the block before. P_rs
+follows by the normalised least mean squares rule. A window of absolute competences could not tell a strategy that
+teaches from one that is merely played while others teach.
+
+All functions are pure, take one state, and can be jitted, scanned and vmapped over independent learners. Shapes are
+static: R is the capacity for regions, S the number of strategies, W the window, d the dimensions of goals.
+
+Source: im = progress / cost of S. M. Nguyen's habilitation thesis; regions: SAGG-RIAC (Baranes and Oudeyer 2013);
+strategies: SGIM-ACTS (Nguyen and Oudeyer 2012).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from star import abstraction as regions
+from star.abstraction import Abstraction, Cut
+from star.config import SelectionConfig
+
+RANDOM, INTEREST, BEST = 0, 1, 2  # modes of a choice
+QUANTILES = 9  # places where a cut is tried along each dimension
+
+
+class SgimState(struct.PyTreeNode):
+    """What is remembered of every region, and of every strategy in it."""
+
+    abstraction: Abstraction
+    costs: Float[Array, "S"]
+    goals: Float[Array, "R W d"]
+    """The goals practised last in each region; slots are overwritten in turn."""
+    competences: Float[Array, "R W"]
+    written: Int[Array, "R"]
+    """Episodes written to the window of each region since it came to be."""
+    mean: Float[Array, "R"]
+    """Mean competence in the last block of each region; NaN before the first."""
+    shares: Float[Array, "R S"]
+    """Share of each strategy in the last block of each region."""
+    gains: Float[Array, "R S"]
+    """P_rs, in units of competence per block."""
+    episodes: Float[Array, "R S"]
+    """Episodes played in all."""
+    refused: Int[Array, ""]
+    """Episodes that were not counted because their competence was not finite."""
+    blocks: Int[Array, ""]
+
+
+class Choice(struct.PyTreeNode):
+    """What to practise: a goal in a region, and the strategy to practise it with."""
+
+    region: Int[Array, "*batch"]
+    strategy: Int[Array, "*batch"]
+    goal: Float[Array, "*batch d"]
+    mode: Int[Array, "*batch"]
+    """RANDOM, INTEREST or BEST: how region and goal were drawn."""
+    log_prob: Float[Array, "*batch"]
+    """Logarithm of the probability of region and strategy."""
+
+
+def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[float] | Array) -> SgimState:
+    """Nothing practised yet in the regions of `abstraction`; `costs` [S] are those of an episode with each strategy.
+
+    Raises:
+      ValueError: if there is no strategy, or a cost is not a positive number.
+
+    """
+    price = np.asarray(costs, np.float32)
+    if price.ndim != 1 or not len(price) or not (np.isfinite(price) & (price > 0)).all():
+        raise ValueError(f"costs: {price.tolist()}; allowed: a list of positive numbers, one for each strategy")
+    capacity, d = abstraction.lower.shape
+    pairs = (capacity, len(price))
+    return SgimState(
+        abstraction=abstraction,
+        costs=jnp.asarray(price),
+        goals=jnp.zeros((capacity, config.window, d)),
+        competences=jnp.zeros((capacity, config.window)),
+        written=jnp.zeros(capacity, jnp.int32),
+        mean=jnp.full(capacity, jnp.nan),
+        shares=jnp.zeros(pairs),
+        gains=jnp.zeros(pairs),
+        episodes=jnp.zeros(pairs),
+        refused=jnp.zeros((), jnp.int32),
+        blocks=jnp.zeros((), jnp.int32),
+    )
+
+
+def progress(config: SelectionConfig, state: SgimState) -> Float[Array, "R"]:
+    """How much the competence of each region has grown over its window, in units of competence; 0 if inactive."""
+    newer, older = _halves(state)
+    grown = _mean(state.competences, newer) - _mean(state.competences, older)
+    return jnp.where(state.abstraction.active & newer.any(axis=-1), grown, 0.0)
+
+
+def interest(config: SelectionConfig, state: SgimState) -> Float[Array, "R S"]:
+    """What each strategy adds to the competence of each region, over its cost; 0 where that is nothing or unknown."""
+    return jnp.where(state.abstraction.active[:, None], _worth(config, state.gains) / state.costs, 0.0)
+
+
+def probabilities(
+    config: SelectionConfig,
+    state: SgimState,
+    available: Bool[Array, "S"] | None = None,
+    admissible: Bool[Array, "R"] | None = None,
+) -> Float[Array, "R S"]:
+    """The distribution that `select` draws region and strategy from; it sums to 1.
+
+    It is 0 on inactive regions, on those not `admissible`, and on strategies not `available`, of which there must be
+    one each.
+    """
+    return _mixture(config, *_distributions(config, state, available, admissible))
+
+
+def select(
+    config: SelectionConfig,
+    state: SgimState,
+    available: Bool[Array, "S"] | None = None,
+    admissible: Bool[Array, "R"] | None = None,
+    *,
+    key: Array,
+) -> Choice:
+    """Draw a region and a strategy, and a goal in the region. Vmap over keys for many choices.
+
+    With probability `random` both are drawn evenly. Otherwise the region is drawn by its progress and the strategy by
+    its interest there; in a share `best` of all choices the goal then lies near the point of the region that
+    `best_point` names, else anywhere in it.
+    """
+    mode_key, region_key, strategy_key, goal_key = jax.random.split(key, 4)
+    shares = jnp.stack([config.random, 1 - config.random - config.best, config.best])
+    mode = jax.random.categorical(mode_key, jnp.log(shares))
+    at_random, by_interest = _distributions(config, state, available, admissible)
+    where, how = jax.tree.map(lambda a, b: jnp.where(mode == RANDOM, a, b), at_random, by_interest)
+    region = jax.random.categorical(region_key, jnp.log(where))
+    strategy = jax.random.categorical(strategy_key, jnp.log(how[region]))
+    return Choice(
+        region=region,
+        strategy=strategy,
+        goal=_goal(config, state, region, mode, key=goal_key),
+        mode=mode,
+        log_prob=jnp.log(_mixture(config, at_random, by_interest)[region, strategy]),
+    )
+
+
+def update(
+    config: SelectionConfig,
+    state: SgimState,
+    choice: Choice,
+    competences: Float[Array, "N"],
+    *,
+    outcomes: Float[Array, "N d"] | None = None,
+    weight: Float[Array, "N"] | None = None,
+) -> SgimState:
+    """The state after one block of N episodes, whose `choice` has the leading axis [N].
+
+    `competences` say how well each goal was reached, 1 at best. Episodes whose competence is not finite are counted as
+    `refused` and change nothing else; those of `weight` 0 are left out. If `outcomes` are given, each counts in the
+    window of its region as a goal that was reached with competence 1.
+    """
+    n, d = choice.goal.shape
+    chex.assert_shape((choice.region, choice.strategy, competences), (n,))
+    given = jnp.ones(n, bool) if weight is None else weight > 0
+    finite = jnp.isfinite(competences)
+    counted = (given & finite).astype(jnp.float32)
+    competences = jnp.where(counted > 0, competences, 0.0)
+    state = _credit(config, state, choice, competences, counted)
+    region, goal, reached, counts = choice.region, choice.goal, competences, counted
+    if outcomes is not None:
+        chex.assert_shape(outcomes, (n, d))
+        where = jax.vmap(lambda point: regions.locate(state.abstraction, point))(outcomes)
+        region, goal = jnp.concatenate([region, where]), jnp.concatenate([goal, outcomes])
+        reached, counts = jnp.concatenate([reached, jnp.ones(n)]), jnp.tile(counts, 2)
+    state = _remember(config, state, region, goal, reached, counts)
+    return state.replace(refused=state.refused + jnp.sum(given & ~finite), blocks=state.blocks + 1)
+
+
+def on_split(
+    config: SelectionConfig,
+    state: SgimState,
+    abstraction: Abstraction,
+    *,
+    parent: Int[Array, ""],
+    child: Int[Array, ""],
+) -> SgimState:
+    """Follow a cut of region `parent`, whose upper part is `child` in the new `abstraction`.
+
+    Each remembered goal goes to the part it lies in, in the order in which it was practised. What is known of
+    strategies, and the mean competence, hold for both parts.
+    """
+    order, known = _newest_first(state)
+    order, known = order[parent, ::-1], known[parent, ::-1]  # oldest first
+    goals, competences = state.goals[parent, order], state.competences[parent, order]
+    above = jnp.all((abstraction.lower[child] <= goals) & (goals <= abstraction.upper[child]), axis=-1)
+    inherit = lambda table: regions.inherit(table, parent=parent, child=child, axes=(0,))  # noqa: E731
+    state = state.replace(
+        abstraction=abstraction,
+        mean=inherit(state.mean),
+        shares=inherit(state.shares),
+        gains=inherit(state.gains),
+        episodes=inherit(state.episodes.at[parent].multiply(0.5)),
+    )
+    for part, mine in ((parent, known & ~above), (child, known & above)):
+        front = jnp.argsort(~mine, stable=True)
+        state = state.replace(
+            goals=state.goals.at[part].set(goals[front]),
+            competences=state.competences.at[part].set(competences[front]),
+            written=state.written.at[part].set(mine.sum()),
+        )
+    return state
+
+
+def split(config: SelectionConfig, state: SgimState) -> tuple[SgimState, Bool[Array, ""]]:
+    """Cut a region whose window is full where the progress of its two sides differs most; and whether one was cut.
+
+    For use without another owner of the regions. Of the cuts at quantiles of the remembered goals along each dimension,
+    with at least `min_side` goals on each side, the one with the largest n1 n2 |P1 - P2| is made (SAGG-RIAC).
+    """
+    full = jnp.where(state.abstraction.active & (state.written >= config.window), state.written, 0)
+    region = jnp.argmax(full)
+    newer, older = (half[region] for half in _halves(state))
+    goals, competences = state.goals[region], state.competences[region]
+
+    def score(dimension: Array, position: Array) -> Float[Array, ""]:
+        above = goals[:, dimension] >= position
+        sizes = jnp.stack([jnp.sum((newer | older) & side) for side in (above, ~above)])
+        grown = [_mean(competences, newer & side) - _mean(competences, older & side) for side in (above, ~above)]
+        value = sizes.prod().astype(jnp.float32) * jnp.abs(grown[0] - grown[1])
+        return jnp.where(sizes.min() >= config.min_side, value, 0.0)
+
+    shares = jnp.arange(1, QUANTILES + 1) / (QUANTILES + 1)
+    positions = jnp.quantile(goals, shares, axis=0).T  # [d, QUANTILES]
+    over_positions = jax.vmap(score, in_axes=(None, 0))
+    scores = jax.vmap(over_positions)(jnp.arange(positions.shape[0]), positions)
+    dimension, index = jnp.unravel_index(jnp.argmax(scores), scores.shape)
+    cut = Cut(region=region, dimension=dimension, position=positions[dimension, index])
+    after, possible = regions.split(state.abstraction, cut, min_width=config.min_width)
+    done = possible & (full[region] > 0) & (scores.max() > 0)
+    cut_state = on_split(config, state, after, parent=region, child=state.abstraction.count)
+    return regions.where(done, cut_state, state), done
+
+
+def _distributions(
+    config: SelectionConfig, state: SgimState, available: Array | None, admissible: Array | None
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """Regions [R] and strategies in each of them [R, S] as drawn at random, and as drawn by interest."""
+    strategies = jnp.ones_like(state.costs, bool) if available is None else available
+    allowed = state.abstraction.active if admissible is None else state.abstraction.active & admissible
+    wanted = interest(config, state)
+    wanted = (wanted / jnp.maximum(wanted.max(axis=-1, keepdims=True), 1e-30)) ** config.sharpness * (wanted > 0)
+    evenly = _shares(jnp.zeros_like(wanted), strategies)
+    by_interest = config.explore * evenly + (1 - config.explore) * _shares(wanted, strategies)
+    grown = _worth(config, progress(config, state))
+    return (_shares(jnp.zeros_like(grown), allowed), evenly), (_shares(grown, allowed), by_interest)
+
+
+def _mixture(
+    config: SelectionConfig, at_random: tuple[Array, Array], by_interest: tuple[Array, Array]
+) -> Float[Array, "R S"]:
+    joint = [where[:, None] * how for where, how in (at_random, by_interest)]
+    return config.random * joint[0] + (1 - config.random) * joint[1]
+
+
+def _shares(worth: Float[Array, "*n K"], mask: Bool[Array, "K"]) -> Float[Array, "*n K"]:
+    """Probabilities in proportion to `worth` where `mask`; even ones where nothing there is worth anything."""
+    worth = worth * mask
+    total = worth.sum(axis=-1, keepdims=True)
+    return jnp.where(total > 0, worth / jnp.where(total > 0, total, 1.0), mask / mask.sum())
+
+
+def _worth(config: SelectionConfig, grown: Array) -> Array:
+    """What growth of competence is worth: loss of it nothing, or with `forgetting` that share of a gain."""
+    return jnp.maximum(grown, -config.forgetting * grown)
+
+
+def _goal(config: SelectionConfig, state: SgimState, region: Array, mode: Array, *, key: Array) -> Float[Array, "d"]:
+    """A point anywhere in the region, or in mode BEST near its best point."""
+    lower, upper = state.abstraction.lower[region], state.abstraction.upper[region]
+    around_key, anywhere_key = jax.random.split(key)
+    around = config.focus * (upper - lower) * jax.random.uniform(around_key, lower.shape, minval=-1.0)
+    near = jnp.clip(_best_point(config, state, region) + around, lower, upper)
+    anywhere = jax.random.uniform(anywhere_key, lower.shape, minval=lower, maxval=upper)
+    return jnp.where((mode == BEST) & (state.written[region] > 0), near, anywhere)
+
+
+def _best_point(config: SelectionConfig, state: SgimState, region: Array) -> Float[Array, "d"]:
+    """The remembered goal whose competence grew most since a neighbour of the older half, or is lowest."""
+    newer, older = (half[region] for half in _halves(state))
+    goals, competences = state.goals[region], state.competences[region]
+    known = _newest_first(state)[1][region]
+    if config.best_point == "worst":
+        slots = _newest_first(state)[0][region]
+        return goals[slots[jnp.argmin(jnp.where(known, competences[slots], jnp.inf))]]
+    apart = jnp.square(goals[:, None] - goals[None]).sum(axis=-1)
+    neighbour = jnp.argmin(jnp.where(older[None], apart, jnp.inf), axis=1)
+    return goals[jnp.argmax(jnp.where(newer, competences - competences[neighbour], -jnp.inf))]
+
+
+def _credit(config: SelectionConfig, state: SgimState, choice: Choice, competences: Array, counted: Array) -> SgimState:
+    """Each region's mean, and what its increment says of the strategies played in this block and the one before."""
+    pair = (choice.region, choice.strategy)
+    played = jnp.zeros_like(state.episodes).at[pair].add(counted)
+    total = jnp.zeros_like(state.mean).at[choice.region].add(counted * competences)
+    count = played.sum(axis=-1)
+    present = count > 0
+    mean = jnp.where(present, total / jnp.maximum(count, 1.0), state.mean)
+    shares = jnp.where(present[:, None], played / jnp.maximum(count, 1.0)[:, None], state.shares)
+    due = (shares + state.shares) / 2
+    surprise = mean - state.mean - jnp.sum(due * state.gains, axis=-1)
+    step = config.credit_rate * surprise / jnp.maximum(jnp.square(due).sum(axis=-1), 1e-6)
+    credited = present & jnp.isfinite(state.mean)  # there was a block before
+    return state.replace(
+        gains=state.gains + jnp.where(credited, step, 0.0)[:, None] * due,
+        shares=shares,
+        mean=mean,
+        episodes=state.episodes + played,
+    )
+
+
+def _remember(
+    config: SelectionConfig, state: SgimState, region: Array, goals: Array, competences: Array, counted: Array
+) -> SgimState:
+    """Write to each region's window, over its oldest episodes, at most `per_block` of this block drawn at random."""
+    order = jax.random.permutation(jax.random.fold_in(jax.random.key(0), state.blocks), len(region))
+    region, goals, competences, counted = region[order], goals[order], competences[order], counted[order]
+    capacity = len(state.written)
+    mine = (region[:, None] == jnp.arange(capacity)) * counted[:, None].astype(jnp.int32)
+    rank = jnp.take_along_axis(jnp.cumsum(mine, axis=0), region[:, None], axis=1)[:, 0] - 1
+    kept = (counted > 0) & (rank < config.per_block)
+    slot = (state.written[region] + rank) % config.window
+    cell = (jnp.where(kept, region, capacity), slot)  # beyond the table: dropped
+    return state.replace(
+        goals=state.goals.at[cell].set(goals, mode="drop"),
+        competences=state.competences.at[cell].set(competences, mode="drop"),
+        written=state.written + jnp.minimum(mine.sum(axis=0), config.per_block),
+    )
+
+
+def _newest_first(state: SgimState) -> tuple[Int[Array, "R W"], Bool[Array, "R W"]]:
+    """Slots of each region's window from the newest to the oldest, and which of these have been written."""
+    window = state.competences.shape[1]
+    back = state.written[:, None] - 1 - jnp.arange(window)
+    return back % window, back >= 0
+
+
+def _halves(state: SgimState) -> tuple[Bool[Array, "R W"], Bool[Array, "R W"]]:
+    """Masks of the slots in the newer and in the older half of what is remembered of each region."""
+    window = state.competences.shape[1]
+    half = (jnp.minimum(state.written, window) // 2)[:, None]
+    age = (state.written[:, None] - 1 - jnp.arange(window)) % window  # of each slot; slots not written are oldest
+    return age < half, (half <= age) & (age < 2 * half)
+
+
+def _mean(values: Array, mask: Bool[Array, "*n K"]) -> Float[Array, "*n"]:
+    """Mean over the last axis where `mask`; 0 where there is nothing."""
+    return jnp.sum(values * mask, axis=-1) / jnp.maximum(mask.sum(axis=-1), 1)

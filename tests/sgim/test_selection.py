@@ -1,0 +1,307 @@
+"""What SGIM selects: against a slow implementation with lists, its exact distribution, and how it follows splits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from star import abstraction as regions
+from star import sgim
+from star.sgim import selection
+
+R, S, D = 5, 3, 2  # capacity, of which four regions are active
+CONFIG = sgim.Config(window=6, per_block=3)
+COSTS = [1.0, 2.0, 5.0]
+
+
+def four_regions(capacity=R):
+    return regions.create(((0.0, 0.0), (4.0, 4.0)), ((2.0,), (2.0,)), max_regions=capacity)
+
+
+def choice_of(region, strategy, goal):
+    n = len(region)
+    zero = jnp.zeros(n)
+    return sgim.Choice(
+        region=jnp.asarray(region),
+        strategy=jnp.asarray(strategy),
+        goal=jnp.asarray(goal, jnp.float32),
+        mode=zero.astype(int),
+        log_prob=zero,
+    )
+
+
+def random_block(rng, n=8, regions_in_use=4):
+    region = rng.integers(0, regions_in_use, n)
+    corner = np.array([[0, 0], [0, 2], [2, 0], [2, 2]])[region % 4]
+    goal = (corner + rng.uniform(0.01, 1.99, (n, D))).astype(np.float32)
+    return choice_of(region, rng.integers(0, S, n), goal), rng.uniform(0, 1, n).astype(np.float32)
+
+
+update = jax.jit(sgim.update)
+probabilities = jax.jit(sgim.probabilities)
+
+
+def practised(blocks, seed=0, config=CONFIG):
+    """A state after `blocks` random blocks, and what they were."""
+    rng = np.random.default_rng(seed)
+    state, history = sgim.init(config, four_regions(), COSTS), []
+    for _ in range(blocks):
+        choice, competences = random_block(rng)
+        state = update(config, state, choice, competences)
+        history.append((choice, competences))
+    return state, history
+
+
+class Slow:
+    """The same with lists, region by region."""
+
+    def __init__(self, window, rate):
+        self.window, self.rate = window, rate
+        self.remembered = [[] for _ in range(R)]
+        self.last = [None] * R  # mean and shares of the block before
+        self.gains = np.zeros((R, S))
+
+    def block(self, choice, competences):
+        for r in range(R):
+            mine = np.asarray(choice.region) == r
+            if not mine.any():
+                continue
+            mean = competences[mine].mean()
+            shares = np.bincount(np.asarray(choice.strategy)[mine], minlength=S) / mine.sum()
+            if self.last[r] is not None:
+                due = (shares + self.last[r][1]) / 2
+                error = mean - self.last[r][0] - due @ self.gains[r]
+                self.gains[r] += self.rate * error * due / (due @ due)
+            self.last[r] = mean, shares
+
+    def progress(self, r):
+        last = self.remembered[r][-self.window :]
+        half = len(last) // 2
+        return np.mean(last[-half:]) - np.mean(last[-2 * half : -half]) if half else 0.0
+
+    def interest(self, r, s):
+        return max(self.gains[r, s], 0) / COSTS[s]
+
+    def probability(self, config, available, admissible):
+        regions_, strategies = np.flatnonzero(admissible[:4]), np.flatnonzero(available)
+        grown = {r: max(self.progress(r), 0) for r in regions_}
+        total = np.zeros((R, S))
+        for r in regions_:
+            p = grown[r] / sum(grown.values()) if sum(grown.values()) > 0 else 1 / len(regions_)
+            wanted = {s: self.interest(r, s) ** config.sharpness for s in strategies}
+            for s in strategies:
+                q = wanted[s] / sum(wanted.values()) if sum(wanted.values()) > 0 else 1 / len(strategies)
+                q = config.explore / len(strategies) + (1 - config.explore) * q
+                total[r, s] = config.random / len(regions_) / len(strategies) + (1 - config.random) * p * q
+        return total
+
+
+@settings(max_examples=25)
+@given(
+    seed=st.integers(0, 2**31),
+    blocks=st.integers(0, 12),
+    absent=st.sets(st.integers(0, S - 1), max_size=S - 1),
+    barred=st.sets(st.integers(0, 3), max_size=3),
+)
+def test_probabilities_are_those_of_lists(seed, blocks, absent, barred):
+    """No region gets more than `per_block` episodes of a block here, since any of them might be left out."""
+    config = sgim.Config(window=6, per_block=8)
+    state, history = practised(blocks, seed, config)
+    slow = Slow(6, config.credit_rate)
+    for choice, competences in history:
+        slow.block(choice, competences)
+    for r in range(4):  # the order within a block is drawn at random: read it off the window
+        slow.remembered[r] = remembered(state, r)
+    available = np.array([s not in absent for s in range(S)])
+    admissible = np.array([r not in barred for r in range(R)])
+    found = np.asarray(probabilities(config, state, jnp.asarray(available), jnp.asarray(admissible)))
+    np.testing.assert_allclose(
+        sgim.interest(config, state), [[slow.interest(r, s) for s in range(S)] for r in range(R)], atol=1e-5
+    )
+    np.testing.assert_allclose(found, slow.probability(config, available, admissible), atol=1e-3)
+    np.testing.assert_allclose(found.sum(), 1, atol=1e-5)
+    assert (found[:, ~available] == 0).all() and (found[~admissible] == 0).all() and (found[4] == 0).all()
+
+
+def remembered(state, r):
+    """Competences in the window of region r, oldest first."""
+    written, window = int(state.written[r]), state.competences.shape[1]
+    return [float(state.competences[r, i % window]) for i in range(max(0, written - window), written)]
+
+
+def test_each_region_remembers_its_last_episodes_and_at_most_so_many_of_a_block():
+    state = sgim.init(CONFIG, four_regions(), COSTS)
+    block = choice_of([0] * 5 + [3], [0] * 6, [[1, 1]] * 5 + [[3, 3]])
+    state = update(CONFIG, state, block, jnp.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.9]))
+    assert len(remembered(state, 0)) == 3 and set(np.round(remembered(state, 0), 3)) < {0.1, 0.2, 0.3, 0.4, 0.5}
+    np.testing.assert_allclose(remembered(state, 3), [0.9])
+    np.testing.assert_allclose(state.mean[jnp.array([0, 3])], [0.3, 0.9])  # of all episodes
+    for competence in (0.6, 0.7, 0.8, 0.85):
+        state = update(CONFIG, state, choice_of([0], [1], [[1, 1]]), jnp.array([competence]))
+    assert len(remembered(state, 0)) == 6
+    np.testing.assert_allclose(remembered(state, 0)[2:], [0.6, 0.7, 0.8, 0.85], rtol=1e-6)
+    assert int(state.blocks) == 5 and float(state.episodes.sum()) == 10
+
+
+def test_select_draws_as_often_as_probabilities_say():
+    state, _ = practised(10, 3)
+    available, admissible = jnp.array([True, False, True]), jnp.array([True, True, False, True, True])
+    keys = jax.random.split(jax.random.key(0), 100_000)
+    drawn = jax.jit(jax.vmap(lambda key: sgim.select(CONFIG, state, available, admissible, key=key)))(keys)
+    expected = np.asarray(sgim.probabilities(CONFIG, state, available, admissible))
+    counts = np.zeros((R, S))
+    np.add.at(counts, (np.asarray(drawn.region), np.asarray(drawn.strategy)), 1)
+    possible = expected > 0
+    assert counts[~possible].sum() == 0 and possible.sum() == 6
+    wanted = expected[possible].astype(float)
+    assert stats.chisquare(counts[possible], wanted / wanted.sum() * len(keys)).pvalue > 1e-3
+    np.testing.assert_allclose(drawn.log_prob, np.log(expected[drawn.region, drawn.strategy]), rtol=1e-5)
+    modes = np.bincount(drawn.mode, minlength=3) / len(keys)
+    np.testing.assert_allclose(modes, [0.2, 0.6, 0.2], atol=0.01)
+
+
+def test_goals_lie_in_their_region_and_near_its_best_point_if_the_mode_says_so():
+    worst = sgim.Config(window=6, best_point="worst", random=0.0, best=1.0)
+    state = sgim.init(worst, four_regions(), COSTS)
+    goals = [[0.2, 0.2], [1.5, 1.5], [1.0, 0.3], [0.4, 1.8]]
+    state = update(worst, state, choice_of([0] * 4, [0] * 4, goals), jnp.array([0.8, 0.1, 0.5, 0.6]))
+    only = jnp.arange(R) == 0
+    keys = jax.random.split(jax.random.key(1), 200)
+    near = jax.vmap(lambda key: sgim.select(worst, state, None, only, key=key))(keys).goal
+    assert (np.abs(near - np.array([1.5, 1.5])) <= 0.2 + 1e-6).all()  # a tenth of a width of 2
+    anywhere = jax.vmap(lambda key: sgim.select(worst, state, None, ~only, key=key))(keys)
+    located = jax.vmap(lambda point: regions.locate(state.abstraction, point))(anywhere.goal)
+    np.testing.assert_array_equal(located, anywhere.region)
+
+
+def test_the_best_point_by_progress_is_where_competence_grew_most_between_neighbours():
+    config = sgim.Config(window=6, random=0.0, best=1.0, focus=0.01)
+    state = sgim.init(config, four_regions(), COSTS)
+    for goal, competence in [
+        ([0.2, 0.2], 0.1), ([1.8, 1.8], 0.6), ([1.0, 1.0], 0.4),
+        ([0.3, 0.2], 0.5), ([1.7, 1.8], 0.7), ([1.1, 1.0], 0.4),
+    ]:  # fmt: skip
+        state = update(config, state, choice_of([0], [0], [goal]), jnp.array([competence]))
+    chosen = sgim.select(config, state, None, jnp.arange(R) == 0, key=jax.random.key(0))
+    np.testing.assert_allclose(chosen.goal, [0.3, 0.2], atol=0.02 + 1e-6)
+
+
+def test_what_is_not_finite_is_counted_and_changes_nothing_else():
+    state, _ = practised(4)
+    rng = np.random.default_rng(7)
+    choice, competences = random_block(rng)
+    broken = competences.copy()
+    broken[[1, 4]] = np.nan, np.inf
+    kept = np.isfinite(broken).astype(np.float32)
+    refused = update(CONFIG, state, choice, broken)
+    left_out = update(CONFIG, state, choice, competences, weight=jnp.asarray(kept))
+    assert int(refused.refused) == 2 and int(left_out.refused) == 0
+    assert_same(refused.replace(refused=left_out.refused), left_out)
+    assert np.isfinite(np.asarray(sgim.probabilities(CONFIG, refused))).all()
+
+
+def assert_same(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_outcomes_count_in_the_window_of_the_region_they_lie_in():
+    state = sgim.init(CONFIG, four_regions(), COSTS)
+    choice = choice_of([0], [1], [[1, 1]])
+    state = update(CONFIG, state, choice, jnp.array([0.25]), outcomes=jnp.array([[3.0, 0.5]]))
+    reached = int(regions.locate(state.abstraction, jnp.array([3.0, 0.5])))
+    assert remembered(state, 0) == [0.25] and remembered(state, reached) == [1.0]
+    np.testing.assert_array_equal(state.goals[reached, 0], [3.0, 0.5])
+    assert float(state.episodes.sum()) == 1 and np.isnan(state.mean[reached])
+
+
+def test_independent_learners_can_be_vmapped_and_without_jit_all_is_the_same():
+    states = [practised(6, seed)[0] for seed in range(3)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    keys = jax.random.split(jax.random.key(5), 3)
+    together = jax.jit(jax.vmap(lambda state, key: sgim.select(CONFIG, state, key=key)))(stacked, keys)
+    for i, (state, key) in enumerate(zip(states, keys, strict=True)):
+        alone = sgim.select(CONFIG, state, key=key)
+        for a, b in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
+            np.testing.assert_allclose(a, b[i], rtol=1e-5)
+    rng = np.random.default_rng(1)
+    choice, competences = random_block(rng)
+    fast, slow = update(CONFIG, states[0], choice, competences), sgim.update(CONFIG, states[0], choice, competences)
+    for a, b in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
+
+
+def test_a_split_hands_every_remembered_goal_to_the_part_it_lies_in_and_compiles_nothing():
+    traces = 0
+
+    @jax.jit
+    def step(state, key):
+        nonlocal traces
+        traces += 1
+        choice = sgim.select(CONFIG, state, key=key)
+        one = jax.tree.map(lambda x: x[None], choice)
+        return sgim.update(CONFIG, state, one, jnp.ones(1)), choice
+
+    state, _ = practised(9, 2)
+    step(state, jax.random.key(0))
+    before = list(zip(np.asarray(state.goals[0]).tolist(), np.asarray(state.competences[0]).tolist(), strict=True))
+    oldest = int(state.written[0]) % CONFIG.window  # nine blocks fill the window
+    in_time = before[oldest:] + before[:oldest]
+    cut = regions.Cut(region=jnp.array(0), dimension=jnp.array(1), position=jnp.array(1.0))
+    after, done = regions.split(state.abstraction, cut, min_width=0.1)
+    assert bool(done)
+    parted = sgim.on_split(CONFIG, state, after, parent=jnp.array(0), child=state.abstraction.count)
+    for part, above in ((0, False), (4, True)):
+        mine = [(goal, competence) for goal, competence in in_time if (goal[1] >= 1.0) == above]
+        assert int(parted.written[part]) == len(mine) > 0
+        np.testing.assert_allclose(parted.goals[part, : len(mine)], [goal for goal, _ in mine])
+        np.testing.assert_allclose(parted.competences[part, : len(mine)], [c for _, c in mine])
+        np.testing.assert_array_equal(parted.gains[part], state.gains[0])
+    np.testing.assert_allclose(parted.episodes.sum(), state.episodes.sum(), rtol=1e-6)
+    step(parted, jax.random.key(0))
+    assert traces == 1
+    chosen = jax.vmap(lambda key: step(parted, key)[1].region)(jax.random.split(jax.random.key(1), 500))
+    assert 4 in np.asarray(chosen)
+
+
+@pytest.mark.parametrize("dimension", [0, 1])
+def test_a_region_of_its_own_is_cut_where_progress_differs(dimension):
+    """Competence grows where the coordinate is above 2.6, elsewhere it is noise."""
+    config = sgim.Config(window=60, per_block=60, min_side=5)
+    hits = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        state = sgim.init(config, regions.create(((0.0, 0.0), (4.0, 4.0)), ((), ()), max_regions=2), [1.0])
+        assert not bool(sgim.split(config, state)[1])
+        for t in range(60):
+            goal = rng.uniform(0, 4, 2)
+            competence = t / 60 if goal[dimension] > 2.6 else 0.5 + 0.1 * rng.normal()
+            state = update(config, state, choice_of([0], [0], [goal]), jnp.array([competence]))
+        parted, done = sgim.split(config, state)
+        assert bool(done) and int(parted.abstraction.count) == 2
+        assert int(parted.written.sum()) == 60
+        width = np.asarray(parted.abstraction.upper[0] - parted.abstraction.lower[0])
+        hits += width[dimension] < 4 and 1.6 < width[dimension] < 3.4
+    assert hits >= 9
+
+
+def test_lost_competence_is_worth_what_forgetting_says():
+    for forgetting, expected in ((0.0, 0.0), (0.5, 0.15), (1.0, 0.3)):
+        config = sgim.Config(window=6, forgetting=forgetting)
+        np.testing.assert_allclose(selection._worth(config, jnp.array(-0.3)), expected)
+        np.testing.assert_allclose(selection._worth(config, jnp.array(0.3)), 0.3)
+
+
+@pytest.mark.parametrize("costs", [[], [1.0, 0.0], [1.0, -2.0], [float("nan")], [[1.0, 2.0]]])
+def test_costs_that_are_not_positive_numbers_are_refused_in_one_line(costs):
+    with pytest.raises(ValueError, match="^costs: .*allowed: a list of positive numbers") as caught:
+        sgim.init(CONFIG, four_regions(), costs)
+    assert "\n" not in str(caught.value)
+
+
+def test_shares_that_make_more_than_one_are_refused():
+    with pytest.raises(ValueError, match="make more than 1"):
+        sgim.Config(random=0.7, best=0.4)
