@@ -34,6 +34,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
+from star.evaluation import bootstrap
 from star.metrics import JsonLines
 
 ROOT = Path(__file__).parents[1]
@@ -123,16 +124,6 @@ def provenance(commit: str | None) -> dict[str, Any]:
     }
 
 
-def interval(values: list[float], statistic: Any) -> tuple[float, float, float]:
-    """The statistic over seeds with its 95 % percentile bootstrap interval; a single seed is its own interval."""
-    data = np.asarray(values, float)
-    middle = float(statistic(data))
-    if len(data) < 2 or np.ptp(data) == 0:
-        return middle, middle, middle
-    found = stats.bootstrap((data,), statistic, method="percentile", vectorized=False, rng=0, n_resamples=4999)
-    return middle, float(found.confidence_interval.low), float(found.confidence_interval.high)
-
-
 def interquartile_mean(values: np.ndarray) -> float:
     """Mean of the middle half."""
     return float(stats.trim_mean(values, 0.25))
@@ -153,7 +144,7 @@ def table(reports: list[dict[str, Any]]) -> str:
             ("success_final", np.mean),
             ("success_final", interquartile_mean),
         ):
-            cells.append("{:.2f} [{:.2f}, {:.2f}]".format(*interval([seed[key] for seed in seeds], statistic)))
+            cells.append("{:.2f} [{:.2f}, {:.2f}]".format(*bootstrap([seed[key] for seed in seeds], statistic)))
         for key, form in (
             ("env_steps_to_level", lambda x: f"{x / 1e6:.1f} M"),
             ("training_seconds_to_level", "{:.0f} s".format),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,16 @@ def proportion_interval(successes: int, trials: int) -> list[float]:
     """Wilson score interval of a proportion at 95 %."""
     interval = stats.binomtest(successes, trials).proportion_ci(0.95, method="wilson")
     return [float(interval.low), float(interval.high)]
+
+
+def bootstrap(values: Sequence[float], statistic: Callable[..., Any]) -> tuple[float, float, float]:
+    """The statistic of `values` with its 95 % percentile bootstrap interval; a single value is its own interval."""
+    data = np.asarray(values, float)
+    middle = float(statistic(data))
+    if len(data) < 2 or np.ptp(data) == 0:
+        return middle, middle, middle
+    found = stats.bootstrap((data,), statistic, method="percentile", vectorized=False, rng=0, n_resamples=4999)
+    return middle, float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
 def mean_interval(values: np.ndarray) -> list[float]:

@@ -169,3 +169,11 @@ def test_the_example_of_the_metrics_page_runs(folder):
     names: dict = {}
     exec(example, names)
     assert names["curve"] == [(2, 0.5)]
+
+
+def test_the_example_of_the_sgim_page_learns_all_three_exercises_and_asks_the_teacher():
+    (example,) = blocks("docs/sgim.md", "python")
+    names: dict = {}
+    exec(example, names)
+    assert (names["skill"] > 0.7).all()
+    assert names["state"].episodes.sum() == 1000 and names["state"].episodes.sum(axis=0)[1] > 300

@@ -1,6 +1,6 @@
-"""Test beds: learners with known laws, to measure how well a selector spends its episodes.
+"""Test beds: learners whose laws are known, to measure how well a selector spends its episodes.
 
-A bed is a pure function of its state, so that whole experiments are scanned and vmapped over seeds.
+A bed is a few pure functions of its latent state, so that whole experiments are scanned and vmapped over seeds.
 """
 
 from __future__ import annotations
@@ -14,45 +14,26 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-Select = Callable[..., tuple[Array, Array]]
-"""(state, *, key) -> region, strategy"""
-Update = Callable[..., Any]
-"""(state, region, strategy, competences [n]) -> state"""
+from star.sgim.selectors import Selector
 
 
-class Gains(NamedTuple):
-    """Latent competences that practice raises: playing (r, s) once does C_r += gain[r, s] (1 - C_r).
+class Bed(NamedTuple):
+    """A learner and what it can practise. Regions are bins of the space of goals, numbered as `cuts` orders them."""
 
-    That holds if the latent competence of region `needs[r]` is above .7, or `needs[r]` is -1. What is observed is C_r
-    plus noise; in the regions of `noisy`, .5 plus N(0, .3^2).
+    space: tuple[tuple[float, ...], tuple[float, ...]]
+    """Lower and upper corner of the space of goals, [d] each."""
+    cuts: Sequence[Sequence[float]]
+    """Where regions are cut along each dimension."""
+    strategies: int
+    start: Any
+    """The latent state before the first episode."""
+    play: Callable[..., tuple[Any, Array]]
+    """(latent, region, strategy, goals [n, d], late, *, key) -> latent, observed competences [n].
+
+    `late` is whether half of the time is over.
     """
-
-    gain: np.ndarray
-    """[R, S]"""
-    needs: Sequence[int]
-    noisy: Sequence[int]
-
-    @property
-    def learnable(self) -> np.ndarray:
-        """Indices of the regions in which something can be learnt."""
-        return np.flatnonzero(self.gain.max(axis=1) > 0)
-
-
-SIX_REGIONS = Gains(
-    gain=np.array(
-        [
-            [0.004, 0.001, 0.008, 0],  # autonomous, procedure, teacher, bad teacher
-            [0.002, 0.006, 0.004, 0],
-            [0.0002, 0.006, 0.001, 0],
-            [0, 0, 0.010, 0],
-            [0, 0, 0, 0],
-            [0, 0, 0, 0],
-        ]
-    ),
-    needs=(-1, 0, 1, -1, -1, -1),
-    noisy=(5,),
-)
-"""Six regions and four strategies: a chain of three, one that only the teacher teaches, a silent one, a noisy one."""
+    mastery: Callable[[Any], Array]
+    """Latent state -> competence in all that can be learnt, 0 to 1."""
 
 
 class Course(struct.PyTreeNode):
@@ -60,52 +41,113 @@ class Course(struct.PyTreeNode):
 
     region: Int[Array, "blocks"]
     strategy: Int[Array, "blocks"]
-    competence: Float[Array, "blocks"]
-    """Mean latent competence over the learnable regions at the end of each block."""
-    regions: Float[Array, "blocks R"]
-    """Latent competence of each region at the end of each block."""
+    mastery: Float[Array, "blocks"]
+    """At the end of each block."""
+    latent: Any
+    """The latent state at the end of each block."""
 
 
-def run(
-    bed: Gains,
-    state: Any,
-    select: Select,
-    update: Update,
-    *,
-    noise: float = 0.0,
-    blocks: int = 2400,
-    episodes: int = 5,
-    later: Gains | None = None,
-    key: Array,
-) -> Course:
-    """Let a selector choose for `blocks` blocks of `episodes` each; half-way the gains become those of `later`.
+def run(bed: Bed, selector: Selector, *, blocks: int = 2400, episodes: int = 5, key: Array) -> Course:
+    """Let a selector choose what to practise in each of `blocks` blocks of `episodes` episodes."""
 
-    `noise` is the standard deviation of observed competences.
-    """
-    gains = jnp.stack([jnp.asarray(each.gain) for each in (bed, later or bed)])
-    needs, noisy = np.asarray(bed.needs), np.isin(np.arange(len(bed.needs)), bed.noisy)
-
-    def block(carry: tuple[Array, Any], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Any], Course]:
+    def block(carry: tuple[Any, Any], inputs: tuple[Array, Array]) -> tuple[tuple[Any, Any], Course]:
         latent, state = carry
         number, key = inputs
-        select_key, noise_key = jax.random.split(key)
-        region, strategy = select(state, key=select_key)
-        need = jnp.asarray(needs)[region]
-        open_ = (need < 0) | (latent[need] > 0.7)
-        gain = gains[(2 * number >= blocks).astype(int), region, strategy] * open_
-        path = 1 - (1 - latent[region]) * (1 - gain) ** jnp.arange(1, episodes + 1)
-        shaken = jax.random.normal(noise_key, (episodes,))
-        seen = jnp.where(jnp.asarray(noisy)[region], 0.5 + 0.3 * shaken, path + noise * shaken)
-        latent = latent.at[region].set(path[-1])
-        state = update(state, region, strategy, seen)
-        course = Course(region=region, strategy=strategy, competence=latent[bed.learnable].mean(), regions=latent)
-        return (latent, state), course
+        select_key, goal_key, play_key = jax.random.split(key, 3)
+        region, strategy = selector.select(state, key=select_key)
+        lower, upper = (jnp.asarray(corner)[region] for corner in corners(bed))
+        goals = jax.random.uniform(goal_key, (episodes, lower.shape[0]), minval=lower, maxval=upper)
+        latent, seen = bed.play(latent, region, strategy, goals, 2 * number >= blocks, key=play_key)
+        state = selector.update(state, region, strategy, goals, seen)
+        return (latent, state), Course(region=region, strategy=strategy, mastery=bed.mastery(latent), latent=latent)
 
     inputs = (jnp.arange(blocks), jax.random.split(key, blocks))
-    return jax.lax.scan(block, (jnp.zeros(len(needs)), state), inputs)[1]
+    return jax.lax.scan(block, (bed.start, selector.state), inputs)[1]
 
 
 def until_mastered(course: Course, *, level: float = 0.9) -> Int[Array, ""]:
-    """Blocks until the mean competence exceeds `level`; their number if it never does."""
-    there = course.competence > level
+    """Blocks until the mastery exceeds `level`; their number if it never does."""
+    there = course.mastery > level
     return jnp.where(there.any(), jnp.argmax(there), there.shape[0])
+
+
+def corners(bed: Bed) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corners of the regions, [R, d] each."""
+    edges = [np.array([low, *cuts, high]) for low, cuts, high in zip(bed.space[0], bed.cuts, bed.space[1], strict=True)]
+    parts = [np.stack(np.meshgrid(*side, indexing="ij"), -1).reshape(-1, len(edges)) for side in
+             ([edge[:-1] for edge in edges], [edge[1:] for edge in edges])]  # fmt: skip
+    return parts[0], parts[1]
+
+
+GAINS = np.array(
+    [
+        [0.004, 0.001, 0.008, 0],  # autonomous, procedure, teacher, bad teacher
+        [0.002, 0.006, 0.004, 0],
+        [0.0002, 0.006, 0.001, 0],
+        [0, 0, 0.010, 0],
+        [0, 0, 0, 0],
+        [0, 0, 0, 0],
+    ]
+)
+
+
+def six_regions(*, noise: float = 0.0, gains: np.ndarray = GAINS, late_gains: np.ndarray | None = None) -> Bed:
+    """A chain of three regions, one that only the teacher teaches, a silent one, a noisy one; four strategies.
+
+    Playing (r, s) once does C_r += gains[r, s] (1 - C_r) if the region that r needs has C > .7: 1 needs 0, 2 needs 1.
+    What is observed is C_r + N(0, noise^2), in the noisy region .5 + N(0, .3^2). In the second half of the time
+    `late_gains` apply.
+    """
+    table = jnp.stack([jnp.asarray(gains), jnp.asarray(gains if late_gains is None else late_gains)])
+    needs, noisy = jnp.array([-1, 0, 1, -1, -1, -1]), 5
+
+    def play(latent: Array, region: Array, strategy: Array, goals: Array, late: Array, *, key: Array) -> tuple:
+        need = needs[region]
+        gain = table[late.astype(int), region, strategy] * ((need < 0) | (latent[need] > 0.7))
+        path = 1 - (1 - latent[region]) * (1 - gain) ** jnp.arange(1, len(goals) + 1)
+        shaken = jax.random.normal(key, path.shape)
+        seen = jnp.where(region == noisy, 0.5 + 0.3 * shaken, path + noise * shaken)
+        return latent.at[region].set(path[-1]), seen
+
+    return Bed(
+        space=((0.0,), (6.0,)),
+        cuts=(range(1, 6),),
+        strategies=4,
+        start=jnp.zeros(6),
+        play=play,
+        mastery=lambda latent: latent[:4].mean(),
+    )
+
+
+def frontier(*, noise: float = 0.05) -> Bed:
+    """Goals in the unit square, which are reached up to a frontier that practice near it moves on.
+
+    A goal x with x_1 >= x_2 is at the difficulty |x|, and reached with probability p = 1 / (1 + exp((|x| - f) / .05));
+    practising it moves f on by gain[s] 4 p (1 - p). With x_1 < x_2 nothing is ever reached. Strategies: autonomous,
+    with gain .001; a teacher, .004, who knows only goals up to |x| = .6; a teacher without effect. Regions: 6 x 6
+    squares.
+    """
+    gains = jnp.array([0.001, 0.004, 0.0])
+
+    def play(latent: Array, region: Array, strategy: Array, goals: Array, late: Array, *, key: Array) -> tuple:
+        far = jnp.linalg.norm(goals, axis=-1)
+        possible = goals[:, 0] >= goals[:, 1]
+
+        def one(front: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
+            distance, can = inputs
+            p = jax.nn.sigmoid((front - distance) / 0.05) * can
+            knows = (strategy != 1) | (distance < 0.6)
+            return front + gains[strategy] * knows * 4 * p * (1 - p), p
+
+        latent, reached = jax.lax.scan(one, latent, (far, possible))
+        return latent, reached + noise * jax.random.normal(key, reached.shape)
+
+    sixths = tuple(i / 6 for i in range(1, 6))
+    return Bed(
+        space=((0.0, 0.0), (1.0, 1.0)),
+        cuts=(sixths, sixths),
+        strategies=3,
+        start=jnp.array(0.1),
+        play=play,
+        mastery=lambda front: jnp.clip(front / 1.4, 0.0, 1.0),
+    )

@@ -1,5 +1,7 @@
 """How SGIM behaves where everything about learning is known: six regions, four strategies, 16 seeds."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,33 +9,20 @@ import pytest
 
 from star import abstraction as regions
 from star import sgim
-from star.sgim import beds
+from star.sgim import beds, selectors
 
 BLOCKS, EPISODES = 2400, 5
 AUTONOMOUS, PROCEDURE, TEACHER, BAD = range(4)
 
 
-def run(*, bed=beds.SIX_REGIONS, noise=0.0, costs=(1, 1, 1, 1), absent=(), sign=1.0, later=None, seeds=16):
+def run(*, bed=None, costs=(1, 1, 1, 1), absent=(), sign=1.0, seeds=16):
     """The courses of `seeds` learners, [seeds, blocks]; `sign` -1 tells them that they get worse when they learn."""
-    config = sgim.Config()
-    space = regions.create(((0.0,), (6.0,)), (range(1, 6),), max_regions=8)
-    start = sgim.init(config, space, costs)
-    available = jnp.array([s not in absent for s in range(4)])
-
-    def select(state, *, key):
-        choice = sgim.select(config, state, available, key=key)
-        return choice.region, choice.strategy
-
-    def update(state, region, strategy, competences):
-        n = competences.shape[0]
-        fill = lambda x: jnp.full(n, x)  # noqa: E731
-        choice = sgim.Choice(fill(region), fill(strategy), fill(region)[:, None] + 0.5, fill(0), fill(0.0))
-        return sgim.update(config, state, choice, sign * competences)
-
-    def one(key):
-        return beds.run(bed, start, select, update, noise=noise, blocks=BLOCKS, episodes=EPISODES, later=later, key=key)
-
-    course = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), seeds))
+    bed = bed or beds.six_regions()
+    space = regions.create(bed.space, bed.cuts, max_regions=8)
+    rule = selectors.sgim(sgim.Config(), space, costs, jnp.array([s not in absent for s in range(4)]))
+    told = rule._replace(update=lambda state, r, s, goals, c: rule.update(state, r, s, goals, sign * c))
+    one = partial(beds.run, bed, told, blocks=BLOCKS, episodes=EPISODES)
+    course = jax.jit(jax.vmap(lambda key: one(key=key)))(jax.random.split(jax.random.key(0), seeds))
     return jax.tree.map(np.asarray, course)
 
 
@@ -60,32 +49,38 @@ def quiet():
 
 
 def test_a_block_of_the_bed_is_that_of_a_loop():
-    latent, key = np.zeros(6), jax.random.key(0)
-    plan = [(0, 2), (1, 0), (0, 0), (4, 1), (3, 2)]
-
-    def select(state, *, key):
-        return jnp.array([r for r, _ in plan])[state], jnp.array([s for _, s in plan])[state]
-
-    course = beds.run(
-        beds.SIX_REGIONS, jnp.int32(0), select, lambda state, *_: state + 1, blocks=5, episodes=5, key=key
+    latent, plan = np.zeros(6), [(0, 2), (1, 0), (0, 0), (4, 1), (3, 2)]
+    region, strategy = jnp.array(plan).T
+    fixed = selectors.Selector(
+        state=jnp.int32(0),
+        select=lambda state, *, key: (region[state], strategy[state]),
+        update=lambda state, *_: state + 1,
     )
+    course = beds.run(beds.six_regions(), fixed, blocks=5, episodes=5, key=jax.random.key(0))
     for i, (r, s) in enumerate(plan):
         for _ in range(5):
-            need = beds.SIX_REGIONS.needs[r]
-            if need < 0 or latent[need] > 0.7:
-                latent[r] += beds.SIX_REGIONS.gain[r, s] * (1 - latent[r])
-        np.testing.assert_allclose(course.regions[i], latent, rtol=1e-4)
-        np.testing.assert_allclose(course.competence[i], latent[:4].mean(), rtol=1e-4)
+            if r not in (1, 2) or latent[r - 1] > 0.7:
+                latent[r] += beds.GAINS[r, s] * (1 - latent[r])
+        np.testing.assert_allclose(course.latent[i], latent, rtol=1e-4)
+        np.testing.assert_allclose(course.mastery[i], latent[:4].mean(), rtol=1e-4)
+
+
+def test_the_regions_of_a_bed_are_numbered_as_those_of_the_abstraction():
+    bed = beds.frontier()
+    lower, upper = beds.corners(bed)
+    made = regions.create(bed.space, bed.cuts, max_regions=36)
+    np.testing.assert_allclose(lower, made.lower, atol=1e-6)
+    np.testing.assert_allclose(upper, made.upper, atol=1e-6)
 
 
 def test_it_practises_what_is_learnable_and_soon_masters_it(quiet):
-    assert quiet.competence.mean() >= 0.87  # uniform choice: .66
+    assert quiet.mastery.mean() >= 0.87  # uniform choice: .66
     assert mastered(quiet).mean() * EPISODES <= 3000  # uniform: 8,600
-    assert (quiet.regions[:, -1, :4] > 0.9).all()
+    assert (quiet.latent[:, -1, :4] > 0.9).all()
 
 
 def test_noise_on_competence_costs_little():
-    assert run(noise=0.05).competence.mean() >= 0.84
+    assert run(bed=beds.six_regions(noise=0.05)).mastery.mean() >= 0.84
 
 
 def test_it_moves_on_when_something_is_mastered(quiet):
@@ -116,16 +111,16 @@ def test_an_expensive_teacher_is_asked_less_and_an_absent_one_never(quiet):
     assert asked[1] < 0.7 * asked[0]
     absent = run(absent=(TEACHER,), seeds=4)
     assert not (absent.strategy == TEACHER).any()
-    assert (absent.regions[:, -1, :3] > 0.8).all()
+    assert (absent.latent[:, -1, :3] > 0.8).all()
 
 
 def test_it_recovers_when_teacher_and_procedure_swap_what_they_teach():
     """Half-way, with learning so slow that nothing is mastered by then."""
-    slow = beds.SIX_REGIONS._replace(gain=beds.SIX_REGIONS.gain / 12)
-    swapped = slow._replace(gain=slow.gain[:, [AUTONOMOUS, TEACHER, PROCEDURE, BAD]])
-    course = run(bed=slow, later=swapped)
+    gains = beds.GAINS / 12
+    swapped = gains[:, [AUTONOMOUS, TEACHER, PROCEDURE, BAD]]
+    course = run(bed=beds.six_regions(gains=gains, late_gains=swapped))
     half = BLOCKS // 2
-    assert (course.regions[:, half, 3] < 0.9).all()
+    assert (course.latent[:, half, 3] < 0.9).all()
     before = (course.region == 3) & (np.arange(BLOCKS) < half)
     after = (course.region == 3) & (np.arange(BLOCKS) >= half + 200)
     asked = [[(course.strategy == s)[when].mean() for s in (PROCEDURE, TEACHER)] for when in (before, after)]
@@ -136,7 +131,7 @@ def test_it_recovers_when_teacher_and_procedure_swap_what_they_teach():
 def test_with_the_sign_of_progress_inverted_it_does_none_of_this():
     inverted = run(sign=-1.0)
     until = mastered(inverted)
-    assert inverted.competence.mean() < 0.8
+    assert inverted.mastery.mean() < 0.8
     assert until.mean() * EPISODES > 3000
     assert share(inverted, region=3, strategy=TEACHER, until=until) < 0.7
     assert share(inverted, region=5, until=until) > 0.10
