@@ -189,8 +189,8 @@ class TutorConfig(LevelConfig):
 
     enabled: bool = Field(True, description="false gives the target box to the Controller itself, as in GARA")
     period: Positive = Field(10, description="l: env steps between the Tutor's decisions")
-    heading: float = Field(
-        0.0, ge=0, description="m: subgoals also say where to face, by a vector of this length; 0: they do not"
+    heading: float | None = Field(
+        None, gt=0, description="m: subgoals also say where to face, by a vector of this length"
     )
     unroll: Positive = Field(5, description="decisions of each environment per update")
     reward_scale: float = Field(0.3, gt=0, description="factor on the reward")
@@ -309,6 +309,12 @@ class SelectionConfig(Section):
     def _shares_fit(self) -> Self:
         if self.random + self.best > 1:
             raise ValueError(f"random {self.random:g} and best {self.best:g} make more than 1")
+        return self
+
+    @model_validator(mode="after")
+    def _window_spans_blocks(self) -> Self:
+        if 2 * self.per_block > self.window:
+            raise ValueError(f"per_block {self.per_block} is more than half of window {self.window}")
         return self
 
 

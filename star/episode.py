@@ -208,7 +208,7 @@ def target_box(
 
 def choose_subgoal(
     config: AgentConfig, spec: Spec, state: TrainState, streams: Streams, *, deterministic: bool, key: Array
-) -> tuple[Float[Array, "B m"], Float[Array, "B d"] | None]:
+) -> tuple[Float[Array, "B m"], Float[Array, "B p"] | None]:
     """(subgoal, action) of the Tutor in every environment; without a Tutor the target box and None."""
     obs = streams.env.obs
     position = spec.abstract(obs)

@@ -217,7 +217,7 @@ def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transi
     )
 
 
-def _later(spec: Spec, steps: Steps) -> Float[Array, "l B 2 d"]:
+def _later(spec: Spec, steps: Steps) -> Float[Array, "l B 2 p"]:
     """Where the agent was at the end of the segment, seen from before and from after each of its env steps."""
     before, after = spec.pose(steps.obs), spec.pose(steps.next_obs)
     return jnp.stack([after[-1] - before, after[-1] - after], axis=-2)
@@ -225,11 +225,11 @@ def _later(spec: Spec, steps: Steps) -> Float[Array, "l B 2 d"]:
 
 def _in_hindsight(config: AgentConfig, spec: Spec, batch: Transition, key: Array) -> Transition:
     """Half of the replayed transitions as if what the agent reached had been its subgoal (Andrychowicz et al. 2017)."""
-    d = len(spec.scale)
-    size = d if config.tutor.enabled else 2 * d
+    p = len(spec.scale)
+    size = p if config.tutor.enabled else 2 * p
     margin = config.commander.goal_margin
     reached = batch.extras
-    if size != d:
+    if size != p:
         reached = jnp.concatenate([reached - margin, reached + margin], axis=-1)
     before, after = reached[:, 0], reached[:, 1]
     price = config.controller.termination_penalty * batch.terminated
@@ -241,7 +241,7 @@ def _in_hindsight(config: AgentConfig, spec: Spec, batch: Transition, key: Array
     return batch.replace(
         obs=pick(batch.obs.at[:, -size:].set(before), batch.obs),
         next_obs=pick(batch.next_obs.at[:, -size:].set(after), batch.next_obs),
-        reward=pick(controller.reward(config.controller, before, after, size=d) - price, batch.reward),
+        reward=pick(controller.reward(config.controller, before, after, size=p) - price, batch.reward),
     )
 
 

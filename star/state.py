@@ -151,8 +151,8 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(f"tutor.unroll: {config.tutor.unroll} does not divide the {segments} decisions of an episode")
     if config.commander.period > spec.episode_length:
         raise ValueError(f"commander.period: {config.commander.period} exceeds the episode of {spec.episode_length}")
-    if config.tutor.heading and not spec.orientation:
-        raise ValueError(f"tutor.heading: {config.tutor.heading:g}, but the body has no orientation; allowed: 0")
+    if spec.heading and not spec.orientation:
+        raise ValueError(f"tutor.heading: {spec.heading:g}, but the body has no orientation; allowed: null")
     cells = int(np.prod(adjacency.shape(config.tutor.adjacency, spec.space)))
     if config.tutor.adjacency.enabled and cells > adjacency.MAX_CELLS:
         raise ValueError(

@@ -1,6 +1,7 @@
 """The Tutor: chooses, every l env steps, a subgoal on the way to the target region. It never sees g*.
 
-    subgoal  g  = clip(action, -1, 1) * scale           relative to s, in the abstract dimensions
+    subgoal  g  = clip(action, -1, 1) * scale           relative to s: to its abstract dimensions, and with a heading
+                                                    to the vector ahead of the body
     reward      = -sum over its l steps ||s_t - centre(G)||      (`distance`, published)
              or   ||s_0 - centre(G)|| - ||s_l - centre(G)||      (`progress`)
 
@@ -37,7 +38,7 @@ class Trace(struct.PyTreeNode):
 
     states: Float[Array, "*batch l state"]
     actions: Float[Array, "*batch l act"]
-    achieved: Float[Array, "*batch l+1 d"]
+    achieved: Float[Array, "*batch l+1 p"]
 
 
 def observe(
@@ -48,8 +49,8 @@ def observe(
     return jnp.concatenate([state, box.lower - origin, box.upper - origin], axis=-1)
 
 
-def subgoal(action: Float[Array, "*batch d"], scale: Float[Array, "d"]) -> Float[Array, "*batch d"]:
-    """The relative subgoal that an action in [-1, 1]^d stands for."""
+def subgoal(action: Float[Array, "*batch p"], scale: Float[Array, "p"]) -> Float[Array, "*batch p"]:
+    """The relative subgoal that an action in [-1, 1]^p stands for."""
     return jnp.clip(action, -1.0, 1.0) * scale
 
 
@@ -66,7 +67,7 @@ def reward(config: TutorConfig, distances: Float[Array, "l + 1 * batch"], alive:
 def correct(
     config: TutorConfig,
     batch: Transition,
-    scale: Float[Array, "d"],
+    scale: Float[Array, "p"],
     mean_action: Callable[[Array, Array], Array],
     *,
     key: Array,

@@ -2,8 +2,8 @@
 
     from star import sgim
     state = sgim.init(sgim.Config(), abstraction, costs=[1.0, 5.0])
-    choice = sgim.select(config, state, key=key)
-    state = sgim.update(config, state, choice, competences)
+    choice = jax.vmap(lambda key: sgim.select(config, state, key=key))(keys)  # [N]
+    state = sgim.update(config, state, choice, competences)  # [N]
 
 Source: S. M. Nguyen, habilitation thesis; SGIM-ACTS (Nguyen and Oudeyer 2012), SGIM-PB (Duminy, Nguyen, Duhaut 2021).
 """

@@ -14,7 +14,7 @@ as a block's mean stands for its middle: half of what is learnt between two midd
 follows by the normalised least mean squares rule. A window of absolute competences could not tell a strategy that
 teaches from one that is merely played while others teach.
 
-All functions are pure, take one state, and can be jitted, scanned and vmapped over independent learners. Shapes are
+All functions but `init` are pure and can be jitted, scanned and vmapped over independent learners. Shapes are
 static: R is the capacity for regions, S the number of strategies, W the window, d the dimensions of goals.
 
 Source: im = progress / cost of S. M. Nguyen's habilitation thesis; regions: SAGG-RIAC (Baranes and Oudeyer 2013);
@@ -51,7 +51,7 @@ class SgimState(struct.PyTreeNode):
     written: Int[Array, "R"]
     """Episodes written to the window of each region since it came to be."""
     mean: Float[Array, "R"]
-    """Mean competence in the last block of each region; NaN before the first."""
+    """Mean competence in the last block of each region; NaN before the first, and after a cut."""
     shares: Float[Array, "R S"]
     """Share of each strategy in the last block of each region."""
     gains: Float[Array, "R S"]
@@ -111,7 +111,7 @@ def progress(config: SelectionConfig, state: SgimState) -> Float[Array, "R"]:
 
 def interest(config: SelectionConfig, state: SgimState) -> Float[Array, "R S"]:
     """What each strategy adds to the competence of each region, over its cost; 0 where that is nothing or unknown."""
-    return jnp.where(state.abstraction.active[:, None], _worth(config, state.gains) / state.costs, 0.0)
+    return jnp.where(state.abstraction.active[:, None], jnp.maximum(state.gains, 0.0) / state.costs, 0.0)
 
 
 def probabilities(
@@ -122,8 +122,8 @@ def probabilities(
 ) -> Float[Array, "R S"]:
     """The distribution that `select` draws region and strategy from; it sums to 1.
 
-    It is 0 on inactive regions, on those not `admissible`, and on strategies not `available`, of which there must be
-    one each.
+    It is 0 on inactive regions, on those not `admissible`, and on strategies not `available`; everywhere if nothing is
+    left to choose.
     """
     return _mixture(config, *_distributions(config, state, available, admissible))
 
@@ -140,10 +140,11 @@ def select(
 
     With probability `random` both are drawn evenly. Otherwise the region is drawn by its progress and the strategy by
     its interest there; in a share `best` of all choices the goal then lies near the point of the region that
-    `best_point` names, else anywhere in it.
+    `best_point` names, else anywhere in it. Where `probabilities` leave nothing to choose, `log_prob` is minus infinity
+    and the rest means nothing.
     """
     mode_key, region_key, strategy_key, goal_key = jax.random.split(key, 4)
-    shares = jnp.stack([config.random, 1 - config.random - config.best, config.best])
+    shares = jnp.stack([config.random, jnp.maximum(1 - config.random - config.best, 0.0), config.best])
     mode = jax.random.categorical(mode_key, jnp.log(shares))
     at_random, by_interest = _distributions(config, state, available, admissible)
     where, how = jax.tree.map(lambda a, b: jnp.where(mode == RANDOM, a, b), at_random, by_interest)
@@ -164,29 +165,22 @@ def update(
     choice: Choice,
     competences: Float[Array, "N"],
     *,
-    outcomes: Float[Array, "N d"] | None = None,
     weight: Float[Array, "N"] | None = None,
 ) -> SgimState:
     """The state after one block of N episodes, whose `choice` has the leading axis [N].
 
-    `competences` say how well each goal was reached, 1 at best. Episodes whose competence is not finite are counted as
-    `refused` and change nothing else; those of `weight` 0 are left out. If `outcomes` are given, each counts in the
-    window of its region as a goal that was reached with competence 1.
+    `competences` say how well each goal was reached, 1 at best. Episodes whose competence or goal is not finite are
+    counted as `refused` and change nothing else; those of `weight` 0 are left out.
     """
-    n, d = choice.goal.shape
+    n = len(competences)
     chex.assert_shape((choice.region, choice.strategy, competences), (n,))
+    chex.assert_shape(choice.goal, (n, state.goals.shape[-1]))
     given = jnp.ones(n, bool) if weight is None else weight > 0
-    finite = jnp.isfinite(competences)
+    finite = jnp.isfinite(competences) & jnp.isfinite(choice.goal).all(axis=-1)
     counted = (given & finite).astype(jnp.float32)
     competences = jnp.where(counted > 0, competences, 0.0)
     state = _credit(config, state, choice, competences, counted)
-    region, goal, reached, counts = choice.region, choice.goal, competences, counted
-    if outcomes is not None:
-        chex.assert_shape(outcomes, (n, d))
-        where = jax.vmap(lambda point: regions.locate(state.abstraction, point))(outcomes)
-        region, goal = jnp.concatenate([region, where]), jnp.concatenate([goal, outcomes])
-        reached, counts = jnp.concatenate([reached, jnp.ones(n)]), jnp.tile(counts, 2)
-    state = _remember(config, state, region, goal, reached, counts)
+    state = _remember(config, state, choice, competences, counted)
     return state.replace(refused=state.refused + jnp.sum(given & ~finite), blocks=state.blocks + 1)
 
 
@@ -200,8 +194,8 @@ def on_split(
 ) -> SgimState:
     """Follow a cut of region `parent`, whose upper part is `child` in the new `abstraction`.
 
-    Each remembered goal goes to the part it lies in, in the order in which it was practised. What is known of
-    strategies, and the mean competence, hold for both parts.
+    Each remembered goal goes to the part it lies in, in the order in which it was practised. What strategies add holds
+    for both parts. Their first blocks credit nobody: a part that is harder than the whole has not been forgotten.
     """
     order, known = _newest_first(state)
     order, known = order[parent, ::-1], known[parent, ::-1]  # oldest first
@@ -210,7 +204,7 @@ def on_split(
     inherit = lambda table: regions.inherit(table, parent=parent, child=child, axes=(0,))  # noqa: E731
     state = state.replace(
         abstraction=abstraction,
-        mean=inherit(state.mean),
+        mean=state.mean.at[jnp.array([parent, child])].set(jnp.nan),
         shares=inherit(state.shares),
         gains=inherit(state.gains),
         episodes=inherit(state.episodes.at[parent].multiply(0.5)),
@@ -226,32 +220,42 @@ def on_split(
 
 
 def split(config: SelectionConfig, state: SgimState) -> tuple[SgimState, Bool[Array, ""]]:
-    """Cut a region whose window is full where the progress of its two sides differs most; and whether one was cut.
+    """Make the cut between whose two sides progress differs most, and say whether there was one.
 
-    For use without another owner of the regions. Of the cuts at quantiles of the remembered goals along each dimension,
-    with at least `min_side` goals on each side, the one with the largest n1 n2 |P1 - P2| is made (SAGG-RIAC).
+    For use without another owner of the regions. Of the cuts through regions with a full window, at quantiles of their
+    goals along each dimension, with at least `min_side` goals and `min_width` on each side, the one with the largest
+    n1 n2 |P1 - P2| is made (SAGG-RIAC); a side's progress is that between its own older and newer half.
     """
-    full = jnp.where(state.abstraction.active & (state.written >= config.window), state.written, 0)
-    region = jnp.argmax(full)
-    newer, older = (half[region] for half in _halves(state))
-    goals, competences = state.goals[region], state.competences[region]
+    slots, known = (x[:, ::-1] for x in _newest_first(state))  # oldest first
+    goals = jnp.take_along_axis(state.goals, slots[..., None], axis=1)
+    competences = jnp.take_along_axis(state.competences, slots, axis=1)
+    full = state.abstraction.active & (state.written >= config.window)
 
-    def score(dimension: Array, position: Array) -> Float[Array, ""]:
-        above = goals[:, dimension] >= position
-        sizes = jnp.stack([jnp.sum((newer | older) & side) for side in (above, ~above)])
-        grown = [_mean(competences, newer & side) - _mean(competences, older & side) for side in (above, ~above)]
-        value = sizes.prod().astype(jnp.float32) * jnp.abs(grown[0] - grown[1])
-        return jnp.where(sizes.min() >= config.min_side, value, 0.0)
+    def grown(values: Array, side: Array) -> Float[Array, ""]:
+        rank, half = jnp.cumsum(side), side.sum() // 2
+        return _mean(values, side & (rank > side.sum() - half)) - _mean(values, side & (rank <= half))
+
+    def score(region: Array, dimension: Array, position: Array) -> Float[Array, ""]:
+        above = goals[region, :, dimension] >= position
+        sides = [known[region] & side for side in (above, ~above)]
+        sizes = jnp.stack([side.sum() for side in sides])
+        differ = jnp.abs(grown(competences[region], sides[0]) - grown(competences[region], sides[1]))
+        lower, upper = state.abstraction.lower[region, dimension], state.abstraction.upper[region, dimension]
+        wide = jnp.minimum(position - lower, upper - position) >= config.min_width
+        allowed = full[region] & wide & (sizes.min() >= config.min_side) & (differ > 1e-6)  # more than rounding
+        return jnp.where(allowed, sizes.prod() * differ, 0.0)
 
     shares = jnp.arange(1, QUANTILES + 1) / (QUANTILES + 1)
-    positions = jnp.quantile(goals, shares, axis=0).T  # [d, QUANTILES]
-    over_positions = jax.vmap(score, in_axes=(None, 0))
-    scores = jax.vmap(over_positions)(jnp.arange(positions.shape[0]), positions)
-    dimension, index = jnp.unravel_index(jnp.argmax(scores), scores.shape)
-    cut = Cut(region=region, dimension=dimension, position=positions[dimension, index])
+    positions = jnp.moveaxis(jnp.quantile(goals, shares, axis=1), 0, -1)  # [R, d, QUANTILES]
+    capacity, d, _ = positions.shape
+    over_positions = jax.vmap(score, in_axes=(None, None, 0))
+    over_dimensions = jax.vmap(over_positions, in_axes=(None, 0, 0))
+    scores = jax.vmap(over_dimensions, in_axes=(0, None, 0))(jnp.arange(capacity), jnp.arange(d), positions)
+    best = jnp.unravel_index(jnp.argmax(scores), scores.shape)
+    cut = Cut(region=best[0], dimension=best[1], position=positions[best])
     after, possible = regions.split(state.abstraction, cut, min_width=config.min_width)
-    done = possible & (full[region] > 0) & (scores.max() > 0)
-    cut_state = on_split(config, state, after, parent=region, child=state.abstraction.count)
+    done = possible & (scores[best] > 0)
+    cut_state = on_split(config, state, after, parent=cut.region, child=state.abstraction.count)
     return regions.where(done, cut_state, state), done
 
 
@@ -261,7 +265,7 @@ def _distributions(
     """Regions [R] and strategies in each of them [R, S] as drawn at random, and as drawn by interest."""
     strategies = jnp.ones_like(state.costs, bool) if available is None else available
     allowed = state.abstraction.active if admissible is None else state.abstraction.active & admissible
-    wanted = interest(config, state)
+    wanted = interest(config, state) * strategies
     wanted = (wanted / jnp.maximum(wanted.max(axis=-1, keepdims=True), 1e-30)) ** config.sharpness * (wanted > 0)
     evenly = _shares(jnp.zeros_like(wanted), strategies)
     by_interest = config.explore * evenly + (1 - config.explore) * _shares(wanted, strategies)
@@ -284,18 +288,18 @@ def _shares(worth: Float[Array, "*n K"], mask: Bool[Array, "K"]) -> Float[Array,
 
 
 def _worth(config: SelectionConfig, grown: Array) -> Array:
-    """What growth of competence is worth: loss of it nothing, or with `forgetting` that share of a gain."""
+    """What growth of a region's competence is worth: loss of it nothing, or with `forgetting` that share of a gain."""
     return jnp.maximum(grown, -config.forgetting * grown)
 
 
 def _goal(config: SelectionConfig, state: SgimState, region: Array, mode: Array, *, key: Array) -> Float[Array, "d"]:
     """A point anywhere in the region, or in mode BEST near its best point."""
     lower, upper = state.abstraction.lower[region], state.abstraction.upper[region]
-    around_key, anywhere_key = jax.random.split(key)
-    around = config.focus * (upper - lower) * jax.random.uniform(around_key, lower.shape, minval=-1.0)
-    near = jnp.clip(_best_point(config, state, region) + around, lower, upper)
-    anywhere = jax.random.uniform(anywhere_key, lower.shape, minval=lower, maxval=upper)
-    return jnp.where((mode == BEST) & (state.written[region] > 0), near, anywhere)
+    point, around = _best_point(config, state, region), config.focus * (upper - lower)
+    near = (mode == BEST) & (state.written[region] > 0)
+    low = jnp.where(near, jnp.maximum(lower, point - around), lower)
+    high = jnp.where(near, jnp.minimum(upper, point + around), upper)
+    return jax.random.uniform(key, lower.shape, minval=low, maxval=high)
 
 
 def _best_point(config: SelectionConfig, state: SgimState, region: Array) -> Float[Array, "d"]:
@@ -333,11 +337,11 @@ def _credit(config: SelectionConfig, state: SgimState, choice: Choice, competenc
 
 
 def _remember(
-    config: SelectionConfig, state: SgimState, region: Array, goals: Array, competences: Array, counted: Array
+    config: SelectionConfig, state: SgimState, choice: Choice, competences: Array, counted: Array
 ) -> SgimState:
     """Write to each region's window, over its oldest episodes, at most `per_block` of this block drawn at random."""
-    order = jax.random.permutation(jax.random.fold_in(jax.random.key(0), state.blocks), len(region))
-    region, goals, competences, counted = region[order], goals[order], competences[order], counted[order]
+    order = jax.random.permutation(jax.random.fold_in(jax.random.key(0), state.blocks), len(competences))
+    region, goals, competences, counted = (x[order] for x in (choice.region, choice.goal, competences, counted))
     capacity = len(state.written)
     mine = (region[:, None] == jnp.arange(capacity)) * counted[:, None].astype(jnp.int32)
     rank = jnp.take_along_axis(jnp.cumsum(mine, axis=0), region[:, None], axis=1)[:, 0] - 1

@@ -108,9 +108,9 @@ class Slow:
 )
 def test_probabilities_are_those_of_lists(seed, blocks, absent, barred):
     """No region gets more than `per_block` episodes of a block here, since any of them might be left out."""
-    config = sgim.Config(window=6, per_block=8)
+    config = sgim.Config(window=16, per_block=8)
     state, history = practised(blocks, seed, config)
-    slow = Slow(6, config.credit_rate)
+    slow = Slow(16, config.credit_rate)
     for choice, competences in history:
         slow.block(choice, competences)
     for r in range(4):  # the order within a block is drawn at random: read it off the window
@@ -164,7 +164,7 @@ def test_select_draws_as_often_as_probabilities_say():
 
 
 def test_goals_lie_in_their_region_and_near_its_best_point_if_the_mode_says_so():
-    worst = sgim.Config(window=6, best_point="worst", random=0.0, best=1.0)
+    worst = sgim.Config(window=8, per_block=4, best_point="worst", random=0.0, best=1.0)
     state = sgim.init(worst, four_regions(), COSTS)
     goals = [[0.2, 0.2], [1.5, 1.5], [1.0, 0.3], [0.4, 1.8]]
     state = update(worst, state, choice_of([0] * 4, [0] * 4, goals), jnp.array([0.8, 0.1, 0.5, 0.6]))
@@ -178,7 +178,7 @@ def test_goals_lie_in_their_region_and_near_its_best_point_if_the_mode_says_so()
 
 
 def test_the_best_point_by_progress_is_where_competence_grew_most_between_neighbours():
-    config = sgim.Config(window=6, random=0.0, best=1.0, focus=0.01)
+    config = sgim.Config(window=6, per_block=3, random=0.0, best=1.0, focus=0.01)
     state = sgim.init(config, four_regions(), COSTS)
     for goal, competence in [
         ([0.2, 0.2], 0.1), ([1.8, 1.8], 0.6), ([1.0, 1.0], 0.4),
@@ -193,12 +193,12 @@ def test_what_is_not_finite_is_counted_and_changes_nothing_else():
     state, _ = practised(4)
     rng = np.random.default_rng(7)
     choice, competences = random_block(rng)
-    broken = competences.copy()
-    broken[[1, 4]] = np.nan, np.inf
-    kept = np.isfinite(broken).astype(np.float32)
-    refused = update(CONFIG, state, choice, broken)
-    left_out = update(CONFIG, state, choice, competences, weight=jnp.asarray(kept))
-    assert int(refused.refused) == 2 and int(left_out.refused) == 0
+    broken, lost = competences.copy(), np.array(choice.goal)
+    broken[[1, 4]], lost[6, 0] = [np.nan, np.inf], np.nan
+    kept = np.isfinite(broken) & np.isfinite(lost).all(axis=1)
+    refused = update(CONFIG, state, choice.replace(goal=jnp.asarray(lost)), broken)
+    left_out = update(CONFIG, state, choice, competences, weight=jnp.asarray(kept, jnp.float32))
+    assert int(refused.refused) == 3 and int(left_out.refused) == 0
     assert_same(refused.replace(refused=left_out.refused), left_out)
     assert np.isfinite(np.asarray(sgim.probabilities(CONFIG, refused))).all()
 
@@ -206,16 +206,6 @@ def test_what_is_not_finite_is_counted_and_changes_nothing_else():
 def assert_same(a, b):
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         np.testing.assert_array_equal(x, y)
-
-
-def test_outcomes_count_in_the_window_of_the_region_they_lie_in():
-    state = sgim.init(CONFIG, four_regions(), COSTS)
-    choice = choice_of([0], [1], [[1, 1]])
-    state = update(CONFIG, state, choice, jnp.array([0.25]), outcomes=jnp.array([[3.0, 0.5]]))
-    reached = int(regions.locate(state.abstraction, jnp.array([3.0, 0.5])))
-    assert remembered(state, 0) == [0.25] and remembered(state, reached) == [1.0]
-    np.testing.assert_array_equal(state.goals[reached, 0], [3.0, 0.5])
-    assert float(state.episodes.sum()) == 1 and np.isnan(state.mean[reached])
 
 
 def test_independent_learners_can_be_vmapped_and_without_jit_all_is_the_same():
@@ -270,7 +260,7 @@ def test_a_split_hands_every_remembered_goal_to_the_part_it_lies_in_and_compiles
 @pytest.mark.parametrize("dimension", [0, 1])
 def test_a_region_of_its_own_is_cut_where_progress_differs(dimension):
     """Competence grows where the coordinate is above 2.6, elsewhere it is noise."""
-    config = sgim.Config(window=60, per_block=60, min_side=5)
+    config = sgim.Config(window=60, min_side=5)
     hits = 0
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -288,9 +278,44 @@ def test_a_region_of_its_own_is_cut_where_progress_differs(dimension):
     assert hits >= 9
 
 
+def test_a_region_that_cannot_be_cut_does_not_keep_others_from_it():
+    """Region 0 remembers one goal again and again; in region 1 competence grows on one side."""
+    config = sgim.Config(window=40, min_side=5)
+    state = sgim.init(config, regions.create(((0.0,), (8.0,)), ((4.0,),), max_regions=3), [1.0])
+    rng = np.random.default_rng(0)
+    for t in range(60):
+        state = update(config, state, choice_of([0], [0], [[1.0]]), jnp.array([rng.uniform()]))
+        if t < 40:
+            goal = rng.uniform(4, 8)
+            state = update(config, state, choice_of([1], [0], [[goal]]), jnp.array([t / 40 if goal > 6 else 0.5]))
+    parted, done = sgim.split(config, state)
+    assert bool(done) and 5 < float(parted.abstraction.upper[1, 0]) < 7
+
+
+def test_where_nothing_is_learnt_a_shift_of_attention_makes_no_cut():
+    """Older goals lie on the left, newer ones on the right; all are reached equally well."""
+    config = sgim.Config(window=40, min_side=5)
+    state = sgim.init(config, regions.create(((0.0,), (4.0,)), ((),), max_regions=2), [1.0])
+    rng = np.random.default_rng(0)
+    for t in range(40):
+        goal = rng.uniform(0, 2) + 2 * (t >= 20)
+        state = update(config, state, choice_of([0], [0], [[goal]]), jnp.array([0.8]))
+    assert not bool(sgim.split(config, state)[1])
+
+
+def test_goals_near_a_face_stay_in_their_region():
+    worst = sgim.Config(window=8, per_block=4, best_point="worst", random=0.0, best=1.0)
+    state = sgim.init(worst, four_regions(), COSTS)
+    state = update(worst, state, choice_of([0], [0], [[1.95, 0.01]]), jnp.array([0.1]))
+    keys = jax.random.split(jax.random.key(0), 500)
+    drawn = jax.vmap(lambda key: sgim.select(worst, state, None, jnp.arange(R) == 0, key=key))(keys)
+    located = jax.vmap(lambda point: regions.locate(state.abstraction, point))(drawn.goal)
+    assert (np.asarray(located) == 0).all() and len(np.unique(drawn.goal[:, 0])) > 400
+
+
 def test_lost_competence_is_worth_what_forgetting_says():
     for forgetting, expected in ((0.0, 0.0), (0.5, 0.15), (1.0, 0.3)):
-        config = sgim.Config(window=6, forgetting=forgetting)
+        config = sgim.Config(forgetting=forgetting)
         np.testing.assert_allclose(selection._worth(config, jnp.array(-0.3)), expected)
         np.testing.assert_allclose(selection._worth(config, jnp.array(0.3)), 0.3)
 
@@ -302,6 +327,50 @@ def test_costs_that_are_not_positive_numbers_are_refused_in_one_line(costs):
     assert "\n" not in str(caught.value)
 
 
-def test_shares_that_make_more_than_one_are_refused():
-    with pytest.raises(ValueError, match="make more than 1"):
-        sgim.Config(random=0.7, best=0.4)
+@pytest.mark.parametrize(
+    "values, said", [({"random": 0.7, "best": 0.4}, "make more than 1"), ({"window": 8}, "more than half of window 8")]
+)
+def test_settings_that_do_not_fit_one_another_are_refused(values, said):
+    with pytest.raises(ValueError, match=said):
+        sgim.Config(**values)
+
+
+@pytest.mark.parametrize("random, best", [(0.8, 0.2), (1.0, 0.0), (0.0, 0.3)])
+def test_modes_are_drawn_as_often_as_their_shares_say(random, best):
+    config = sgim.Config(window=6, per_block=3, random=random, best=best)
+    state, _ = practised(4, config=config)
+    keys = jax.random.split(jax.random.key(0), 4000)
+    drawn = jax.jit(jax.vmap(lambda key: sgim.select(config, state, key=key)))(keys)
+    modes = np.bincount(drawn.mode, minlength=3) / len(keys)
+    np.testing.assert_allclose(modes, [random, 1 - random - best, best], atol=0.03)
+
+
+@pytest.mark.parametrize("available, admissible", [([False] * S, None), (None, [False] * R)])
+def test_where_nothing_is_left_to_choose_the_choice_says_so(available, admissible):
+    state, _ = practised(4)
+    masks = [None if mask is None else jnp.array(mask) for mask in (available, admissible)]
+    assert (sgim.probabilities(CONFIG, state, *masks) == 0).all()
+    assert float(sgim.select(CONFIG, state, *masks, key=jax.random.key(0)).log_prob) == -np.inf
+
+
+def test_a_cut_alone_credits_no_strategy():
+    """The parts differ in competence, but nothing is learnt in either."""
+    state = sgim.init(CONFIG, four_regions(), COSTS)
+    for _ in range(3):
+        state = update(CONFIG, state, choice_of([0, 0], [0, 1], [[0.5, 0.5], [0.5, 1.5]]), jnp.array([0.9, 0.1]))
+    np.testing.assert_allclose(state.gains, 0, atol=1e-6)
+    cut = regions.Cut(region=jnp.array(0), dimension=jnp.array(1), position=jnp.array(1.0))
+    after, _ = regions.split(state.abstraction, cut, min_width=0.1)
+    state = sgim.on_split(CONFIG, state, after, parent=jnp.array(0), child=state.abstraction.count)
+    for _ in range(2):
+        state = update(CONFIG, state, choice_of([0, 4], [0, 1], [[0.5, 0.5], [0.5, 1.5]]), jnp.array([0.9, 0.1]))
+    np.testing.assert_allclose(state.gains, 0, atol=1e-6)
+    np.testing.assert_allclose(state.mean[jnp.array([0, 4])], [0.9, 0.1])
+
+
+def test_an_absent_strategy_does_not_drown_the_differences_between_those_available():
+    config = sgim.Config(window=6, per_block=3, sharpness=20.0)
+    state, _ = practised(4, config=config)
+    state = state.replace(gains=jnp.broadcast_to(jnp.array([0.1, 1e-4, 0.0]), (R, S)))
+    shares = np.asarray(sgim.probabilities(config, state, jnp.array([False, True, True]))).sum(axis=0)
+    assert shares[0] == 0 and shares[1] > 3 * shares[2]
