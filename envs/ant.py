@@ -81,7 +81,7 @@ class Ant:
         """Live in the model of `physics`, whose first 15 qpos, 14 qvel and 8 controls are the ant's."""
         self.physics = physics
         self.action_size = physics.model.nu
-        self.orientation = ORIENTATION
+        self.orientation: tuple[int, ...] = ORIENTATION
         self.dt = physics.dt
         self._arena = task.arena
         self._switch: Switch | None = task.switch

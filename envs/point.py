@@ -44,7 +44,7 @@ class Point:
     """The body for `MazeEnv`: state (x, y, vx, vy), and 1 for each open gate if `full`; 2 actions."""
 
     action_size = 2
-    orientation = ()
+    orientation: tuple[int, ...] = ()
     dt = 0.1
     engine = "jax"
 
