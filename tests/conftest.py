@@ -5,6 +5,7 @@ import os
 os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # compilation is most of what tests cost
 
+from dataclasses import replace  # noqa: E402
 from types import SimpleNamespace  # noqa: E402
 
 import jax  # noqa: E402
@@ -100,6 +101,12 @@ def breaking_env():
         flip="terminate",
     )
     return envs.VectorEnv(env, NUM_ENVS, auto_reset=False)
+
+
+@pytest.fixture(scope="session")
+def turning(breaking_env):
+    """What the levels know of it if its whole state is read as a quaternion and subgoals set a heading."""
+    return replace(star.state.Spec.of(breaking_env.env, heading=2.0), orientation=(0, 1, 2, 3))
 
 
 def record(agent, spec, env, state, key):

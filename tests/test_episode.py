@@ -1,7 +1,5 @@
 """The clocks of the levels, the moving subgoal and the statistics, against loops written from the equations."""
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import envs
 import star.state
 from star import abstraction as regions
-from star import config, episode, hierarchy
+from star import config, episode
 from star.state import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and the environments of the recording
@@ -232,8 +230,8 @@ def test_the_pose_adds_a_vector_of_the_length_of_the_heading_that_points_where_t
     np.testing.assert_array_equal(Spec.of(env).scale, [10, 10])
 
 
-def test_subgoals_with_a_heading_stay_where_they_are_while_the_agent_moves_and_turns(breaking_env, tiny):
-    spec = turning(breaking_env)
+def test_subgoals_with_a_heading_stay_where_they_are_while_the_agent_moves_and_turns(breaking_env, tiny, turning):
+    spec = turning
     agent = config.parse(tiny).agent()
 
     def rolled(key):
@@ -248,31 +246,6 @@ def test_subgoals_with_a_heading_stay_where_they_are_while_the_agent_moves_and_t
     wanted = (pose + steps.subgoal)[:, going]
     assert going.any() and (np.ptp(pose[:, going], axis=0) > 1e-3).all()
     np.testing.assert_allclose(wanted, np.broadcast_to(wanted[0], wanted.shape), atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        {"tutor.learner": "td3", "tutor.off_policy_correction": True, "tutor.adjacency.enabled": True},
-        {"tutor.adjacency.enabled": True, "controller.learner": "td3", "controller.hindsight": True},
-    ],
-    ids=["replayed", "on policy"],
-)
-def test_every_part_of_the_low_levels_takes_subgoals_with_a_heading(breaking_env, tiny, overrides):
-    td3 = {"hidden": [8], "batch_size": 8, "buffer_size": 64, "min_transitions": 8, "updates_per_rollout": 2}
-    values = {**tiny, "tutor": {**tiny["tutor"], "td3": td3}, "controller": {**tiny.get("controller", {}), "td3": td3}}
-    agent, spec = config.parse(values, overrides).agent(), turning(breaking_env)
-    start = star.state.init(agent, spec, key=jax.random.key(0))
-    end, metrics = jax.jit(lambda state: hierarchy.epoch(agent, spec, breaking_env, state))(start)
-    assert all(np.isfinite(value) for value in metrics.values())
-    for before, after in ((start.tutor, end.tutor), (start.controller, end.controller)):
-        moved = jax.tree.map(lambda a, b: bool((a != b).any()), before.params, after.params)
-        assert any(jax.tree.leaves(moved))
-
-
-def turning(env):
-    """What the levels know of an environment whose whole state is read as a quaternion; subgoals set a heading."""
-    return replace(Spec.of(env.env, heading=2.0), orientation=(0, 1, 2, 3))
 
 
 @pytest.mark.parametrize("hold", [True, False])

@@ -132,8 +132,8 @@ def test_the_tutors_chain_is_cut_where_the_target_or_the_episode_ends(recording)
 class Epoch:
     """The jitted epoch for one configuration and for two at once, with the number of times each was traced."""
 
-    def __init__(self, env, values):
-        self.spec = Spec.of(env.env)
+    def __init__(self, env, values, spec=None):
+        self.spec = spec or Spec.of(env.env)
         self.config = config.parse(values)
         self.traces = 0
 
@@ -281,7 +281,8 @@ def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tin
     assert section in str(caught.value) and "batch_size" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_the_published_learners_run_a_whole_epoch(breaking_env, tiny):
+@pytest.mark.parametrize("headed", [False, True])
+def test_the_published_learners_run_a_whole_epoch(breaking_env, turning, tiny, headed):
     td3 = {"hidden": [8], "batch_size": 8, "buffer_size": 64, "min_transitions": 8, "updates_per_rollout": 2}
     values = {
         **tiny,
@@ -289,7 +290,7 @@ def test_the_published_learners_run_a_whole_epoch(breaking_env, tiny):
         "tutor": {"period": L, "unroll": 2, "learner": "td3", "off_policy_correction": True, "td3": td3},
         "controller": {"learner": "td3", "td3": td3},
     }
-    published = Epoch(breaking_env, values)
+    published = Epoch(breaking_env, values, turning if headed else None)
     start = published.init(jax.random.key(0))
     end, metrics = published.one(published.config.agent(), start)
     assert int(end.tutor.updates) == 10 and int(end.controller.updates) == 20
@@ -309,9 +310,10 @@ LEVELS = {
 
 
 @pytest.mark.parametrize("name", LEVELS)
-def test_levels_can_be_left_out(breaking_env, tiny, name):
+def test_levels_can_be_left_out(breaking_env, turning, tiny, name):
+    """HRAC with subgoals that set a heading, of which adjacency knows nothing."""
     values = config.parse(tiny, LEVELS[name]).model_dump(mode="json")
-    agent = Epoch(breaking_env, values)
+    agent = Epoch(breaking_env, values, turning if name == "hrac" else None)
     start = agent.init(jax.random.key(0))
     end, metrics = agent.one(agent.config.agent(), start)
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), start.controller.params, end.controller.params)
