@@ -42,6 +42,13 @@ def random_block(rng, n=8, regions_in_use=4):
 
 update = jax.jit(sgim.update)
 probabilities = jax.jit(sgim.probabilities)
+split = jax.jit(sgim.split)
+
+
+@jax.jit
+def draw(config, state, keys, admissible):
+    """A choice for every key."""
+    return jax.vmap(lambda key: sgim.select(config, state, None, admissible, key=key))(keys)
 
 
 def practised(blocks, seed=0, config=CONFIG):
@@ -170,9 +177,9 @@ def test_goals_lie_in_their_region_and_near_its_best_point_if_the_mode_says_so()
     state = update(worst, state, choice_of([0] * 4, [0] * 4, goals), jnp.array([0.8, 0.1, 0.5, 0.6]))
     only = jnp.arange(R) == 0
     keys = jax.random.split(jax.random.key(1), 200)
-    near = jax.vmap(lambda key: sgim.select(worst, state, None, only, key=key))(keys).goal
+    near = draw(worst, state, keys, only).goal
     assert (np.abs(near - np.array([1.5, 1.5])) <= 0.2 + 1e-6).all()  # a tenth of a width of 2
-    anywhere = jax.vmap(lambda key: sgim.select(worst, state, None, ~only, key=key))(keys)
+    anywhere = draw(worst, state, keys, ~only)
     located = jax.vmap(lambda point: regions.locate(state.abstraction, point))(anywhere.goal)
     np.testing.assert_array_equal(located, anywhere.region)
 
@@ -185,8 +192,8 @@ def test_the_best_point_by_progress_is_where_competence_grew_most_between_neighb
         ([0.3, 0.2], 0.5), ([1.7, 1.8], 0.7), ([1.1, 1.0], 0.4),
     ]:  # fmt: skip
         state = update(config, state, choice_of([0], [0], [goal]), jnp.array([competence]))
-    chosen = sgim.select(config, state, None, jnp.arange(R) == 0, key=jax.random.key(0))
-    np.testing.assert_allclose(chosen.goal, [0.3, 0.2], atol=0.02 + 1e-6)
+    chosen = draw(config, state, jax.random.split(jax.random.key(0), 1), jnp.arange(R) == 0)
+    np.testing.assert_allclose(chosen.goal[0], [0.3, 0.2], atol=0.02 + 1e-6)
 
 
 def test_what_is_not_finite_is_counted_and_changes_nothing_else():
@@ -265,12 +272,12 @@ def test_a_region_of_its_own_is_cut_where_progress_differs(dimension):
     for seed in range(10):
         rng = np.random.default_rng(seed)
         state = sgim.init(config, regions.create(((0.0, 0.0), (4.0, 4.0)), ((), ()), max_regions=2), [1.0])
-        assert not bool(sgim.split(config, state)[1])
+        assert not bool(split(config, state)[1])
         for t in range(60):
             goal = rng.uniform(0, 4, 2)
             competence = t / 60 if goal[dimension] > 2.6 else 0.5 + 0.1 * rng.normal()
             state = update(config, state, choice_of([0], [0], [goal]), jnp.array([competence]))
-        parted, done = sgim.split(config, state)
+        parted, done = split(config, state)
         assert bool(done) and int(parted.abstraction.count) == 2
         assert int(parted.written.sum()) == 60
         width = np.asarray(parted.abstraction.upper[0] - parted.abstraction.lower[0])
@@ -288,7 +295,7 @@ def test_a_region_that_cannot_be_cut_does_not_keep_others_from_it():
         if t < 40:
             goal = rng.uniform(4, 8)
             state = update(config, state, choice_of([1], [0], [[goal]]), jnp.array([t / 40 if goal > 6 else 0.5]))
-    parted, done = sgim.split(config, state)
+    parted, done = split(config, state)
     assert bool(done) and 5 < float(parted.abstraction.upper[1, 0]) < 7
 
 
@@ -300,7 +307,7 @@ def test_where_nothing_is_learnt_a_shift_of_attention_makes_no_cut():
     for t in range(40):
         goal = rng.uniform(0, 2) + 2 * (t >= 20)
         state = update(config, state, choice_of([0], [0], [[goal]]), jnp.array([0.8]))
-    assert not bool(sgim.split(config, state)[1])
+    assert not bool(split(config, state)[1])
 
 
 def test_goals_near_a_face_stay_in_their_region():
@@ -308,7 +315,7 @@ def test_goals_near_a_face_stay_in_their_region():
     state = sgim.init(worst, four_regions(), COSTS)
     state = update(worst, state, choice_of([0], [0], [[1.95, 0.01]]), jnp.array([0.1]))
     keys = jax.random.split(jax.random.key(0), 500)
-    drawn = jax.vmap(lambda key: sgim.select(worst, state, None, jnp.arange(R) == 0, key=key))(keys)
+    drawn = draw(worst, state, keys, jnp.arange(R) == 0)
     located = jax.vmap(lambda point: regions.locate(state.abstraction, point))(drawn.goal)
     assert (np.asarray(located) == 0).all() and len(np.unique(drawn.goal[:, 0])) > 400
 
@@ -340,7 +347,7 @@ def test_modes_are_drawn_as_often_as_their_shares_say(random, best):
     config = sgim.Config(window=6, per_block=3, random=random, best=best)
     state, _ = practised(4, config=config)
     keys = jax.random.split(jax.random.key(0), 4000)
-    drawn = jax.jit(jax.vmap(lambda key: sgim.select(config, state, key=key)))(keys)
+    drawn = draw(config, state, keys, None)
     modes = np.bincount(drawn.mode, minlength=3) / len(keys)
     np.testing.assert_allclose(modes, [random, 1 - random - best, best], atol=0.03)
 
