@@ -24,6 +24,7 @@ import numpy as np
 
 from envs import scene
 from envs.arena import BLOCK, HEIGHT
+from envs.maze import yaw
 from envs.physics import Physics, PhysicsState
 from envs.tasks import PRESETS, Switch, Task
 
@@ -31,7 +32,7 @@ MAX_TORQUE = 30.0  # N m
 START_POSITION = 0.1  # half-range of the start qpos, m and rad
 START_SPEED = 0.1  # standard deviation of the start qvel, m/s and rad/s
 STEP_SCALE = 0.001  # of the step count in the state
-ORIENTATION = (3, 4, 5, 6)  # indices of the quaternion in the state
+ORIENTATION = (3, 4, 5, 6)  # indices of the quaternion in qpos and in the state
 QPOS, QVEL = 15, 14  # the ant's own positions and velocities; those of blocks follow
 ON_ITS_BACK = -0.5  # the ant is flipped when the vertical part of its own up axis is below
 LIFT = 2 * HEIGHT  # how far an open gate is lifted, m
@@ -154,6 +155,6 @@ class Ant:
 
     def _at_switch(self, data: PhysicsState) -> jax.Array:
         assert self._switch is not None
-        x, y, _, w, i, j, k = data.qpos[:7]
-        yaw = jnp.arctan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j**2 + k**2))
-        return self._switch.holds(jnp.stack([x, y])) & (self._switch.yaw[0] <= yaw) & (yaw <= self._switch.yaw[1])
+        low, high = self._switch.yaw
+        facing = yaw(data.qpos[np.asarray(ORIENTATION)])
+        return self._switch.holds(data.qpos[:2]) & (low <= facing) & (facing <= high)

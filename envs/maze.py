@@ -218,6 +218,12 @@ class MazeEnv(Env):
         return {"distance": distance, "success": (distance < self.success_radius).astype(jnp.float32)}
 
 
+def yaw(quaternion: jax.Array) -> jax.Array:
+    """Angle about z [...], in rad from -pi to pi, of unit quaternions [..., 4] (w, x, y, z)."""
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    return jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
+
+
 def sample(places: Places, rng: jax.Array) -> jax.Array:
     """One point [k] of `places`."""
     lower, upper = np.asarray(places.lower, np.float32), np.asarray(places.upper, np.float32)

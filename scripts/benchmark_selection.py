@@ -23,7 +23,6 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from star import abstraction as regions
 from star import sgim
 from star.evaluation import bootstrap
 from star.sgim import beds, selectors
@@ -35,7 +34,7 @@ EPISODES = 5  # of a block
 
 def all_beds() -> dict[str, tuple[Bed, list[int], list[int]]]:
     """Beds by name, with their hopeless regions and idle strategies."""
-    lower, upper = beds.corners(beds.frontier())
+    lower, upper = beds.frontier().regions.lower, beds.frontier().regions.upper
     above = [r for r in range(len(lower)) if upper[r, 0] <= lower[r, 1]]  # x_1 < x_2 everywhere
     six = {f"six regions, noise {noise:g}": (beds.six_regions(noise=noise), [4, 5], [3]) for noise in (0, 0.05, 0.2)}
     return {**six, "frontier": (beds.frontier(), above, [2])}
@@ -43,8 +42,7 @@ def all_beds() -> dict[str, tuple[Bed, list[int], list[int]]]:
 
 def all_selectors(bed: Bed) -> Iterator[tuple[str, str, Selector]]:
     """Name, constants and selector."""
-    count = len(beds.corners(bed)[0])
-    size, space = (count, bed.strategies), regions.create(bed.space, bed.cuts, max_regions=count)
+    size, space = (bed.regions.capacity, bed.strategies), bed.regions
     costs = [1.0] * bed.strategies
     yield "uniform", "", selectors.uniform(*size)
     yield "round robin", "", selectors.round_robin(*size)

@@ -148,7 +148,7 @@ def record_run(
     vector, spec = VectorEnv(env, envs, auto_reset=False), program.spec
 
     def record(env_state: Any, subgoal: jax.Array, box: Box) -> Moments:
-        aim = box.centre if state.tutor is None else (spec.pose(env_state.obs) + subgoal)[..., : box.lower.shape[-1]]
+        aim = box.centre if state.tutor is None else spec.abstract(env_state.obs) + subgoal[..., : box.lower.shape[-1]]
         return _look(env, env_state).replace(subgoal=aim, lower=box.lower, upper=box.upper)
 
     def play(agent: Any, state: Any, key: jax.Array) -> tuple[Moments, Moments]:

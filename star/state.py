@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from envs.maze import yaw
 from star import abstraction as regions
 from star import adjacency, commander, controller, forward_model, learner, refinement
 from star.abstraction import Abstraction
@@ -39,11 +40,11 @@ class Spec:
     success_radius: float
     orientation: tuple[int, ...] = ()
     """Indices of the body's unit quaternion (w, x, y, z) in the state; empty if it has none."""
-    heading: float = 0.0
-    """Length, in m, of the heading vector that subgoals set too; 0 if they do not."""
+    heading: float | None = None
+    """Length, in m, of the heading vector that subgoals set too; None if they do not."""
 
     @classmethod
-    def of(cls, env: Any, *, heading: float = 0.0) -> Spec:
+    def of(cls, env: Any, *, heading: float | None = None) -> Spec:
         """Read the spec off an environment of `envs.make`."""
         return cls(
             state_dim=env.state_dim,
@@ -62,7 +63,7 @@ class Spec:
     @property
     def scale(self) -> Float[Array, "p"]:
         """Half-ranges of the Tutor's subgoals."""
-        return jnp.asarray(self.subgoal_scale + (self.heading,) * (2 if self.heading else 0))
+        return jnp.asarray(self.subgoal_scale + ((self.heading, self.heading) if self.heading else ()))
 
     def state(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch state"]:
         """The state part of an observation."""
@@ -83,9 +84,8 @@ class Spec:
         """
         if not self.heading:
             return self.abstract(obs)
-        w, x, y, z = (obs[..., i] for i in self.orientation)
-        yaw = jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
-        ahead = self.heading * jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
+        facing = yaw(obs[..., np.asarray(self.orientation)])
+        ahead = self.heading * jnp.stack([jnp.cos(facing), jnp.sin(facing)], axis=-1)
         return jnp.concatenate([self.abstract(obs), ahead], axis=-1)
 
     def goal_point(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch d"]:

@@ -74,7 +74,7 @@ def build(config: Config) -> Program:
     """Make the environments and the jitted functions of `config`; raises `ConfigError` if they cannot be made."""
     select_device(config.trainer.device)
     env = make_env(config, "train")
-    spec = Spec.of(env, heading=(config.tutor.enabled and config.tutor.heading) or 0.0)
+    spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
     config = _resolve(config, env.engine, spec)
     try:
         states.check(config, spec)

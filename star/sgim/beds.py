@@ -5,7 +5,7 @@ A bed is a few pure functions of its latent state, so that whole experiments are
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,16 +14,15 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from star.abstraction import Abstraction, create
 from star.sgim.selectors import Selector
 
 
 class Bed(NamedTuple):
-    """A learner and what it can practise. Regions are bins of the space of goals, numbered as `cuts` orders them."""
+    """A learner and what it can practise."""
 
-    space: tuple[tuple[float, ...], tuple[float, ...]]
-    """Lower and upper corner of the space of goals, [d] each."""
-    cuts: Sequence[Sequence[float]]
-    """Where regions are cut along each dimension."""
+    regions: Abstraction
+    """Bins of the space of goals, all active."""
     strategies: int
     start: Any
     """The latent state before the first episode."""
@@ -55,7 +54,7 @@ def run(bed: Bed, selector: Selector, *, blocks: int = 2400, episodes: int = 5, 
         number, key = inputs
         select_key, goal_key, play_key = jax.random.split(key, 3)
         region, strategy = selector.select(state, key=select_key)
-        lower, upper = (jnp.asarray(corner)[region] for corner in corners(bed))
+        lower, upper = bed.regions.lower[region], bed.regions.upper[region]
         goals = jax.random.uniform(goal_key, (episodes, lower.shape[0]), minval=lower, maxval=upper)
         latent, seen = bed.play(latent, region, strategy, goals, 2 * number >= blocks, key=play_key)
         state = selector.update(state, region, strategy, goals, seen)
@@ -69,14 +68,6 @@ def until_mastered(course: Course, *, level: float = 0.9) -> Int[Array, ""]:
     """Blocks until the mastery exceeds `level`; their number if it never does."""
     there = course.mastery > level
     return jnp.where(there.any(), jnp.argmax(there), there.shape[0])
-
-
-def corners(bed: Bed) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corners of the regions, [R, d] each."""
-    edges = [np.array([low, *cuts, high]) for low, cuts, high in zip(bed.space[0], bed.cuts, bed.space[1], strict=True)]
-    parts = [np.stack(np.meshgrid(*side, indexing="ij"), -1).reshape(-1, len(edges)) for side in
-             ([edge[:-1] for edge in edges], [edge[1:] for edge in edges])]  # fmt: skip
-    return parts[0], parts[1]
 
 
 GAINS = np.array(
@@ -110,8 +101,7 @@ def six_regions(*, noise: float = 0.0, gains: np.ndarray = GAINS, late_gains: np
         return latent.at[region].set(path[-1]), seen
 
     return Bed(
-        space=((0.0,), (6.0,)),
-        cuts=(range(1, 6),),
+        regions=create(((0.0,), (6.0,)), (range(1, 6),), max_regions=6),
         strategies=4,
         start=jnp.zeros(6),
         play=play,
@@ -144,8 +134,7 @@ def frontier(*, noise: float = 0.05) -> Bed:
 
     sixths = tuple(i / 6 for i in range(1, 6))
     return Bed(
-        space=((0.0, 0.0), (1.0, 1.0)),
-        cuts=(sixths, sixths),
+        regions=create(((0.0, 0.0), (1.0, 1.0)), (sixths, sixths), max_regions=36),
         strategies=3,
         start=jnp.array(0.1),
         play=play,

@@ -304,12 +304,11 @@ def _goal(config: SelectionConfig, state: SgimState, region: Array, mode: Array,
 
 def _best_point(config: SelectionConfig, state: SgimState, region: Array) -> Float[Array, "d"]:
     """The remembered goal whose competence grew most since a neighbour of the older half, or is lowest."""
-    newer, older = (half[region] for half in _halves(state))
     goals, competences = state.goals[region], state.competences[region]
-    known = _newest_first(state)[1][region]
     if config.best_point == "worst":
-        slots = _newest_first(state)[0][region]
-        return goals[slots[jnp.argmin(jnp.where(known, competences[slots], jnp.inf))]]
+        known = jnp.arange(len(competences)) < state.written[region]
+        return goals[jnp.argmin(jnp.where(known, competences, jnp.inf))]
+    newer, older = (half[region] for half in _halves(state))
     apart = jnp.square(goals[:, None] - goals[None]).sum(axis=-1)
     neighbour = jnp.argmin(jnp.where(older[None], apart, jnp.inf), axis=1)
     return goals[jnp.argmax(jnp.where(newer, competences - competences[neighbour], -jnp.inf))]

@@ -83,21 +83,21 @@ def fixed_frequency(
 def ucb(regions: int, strategies: int, *, bonus: float, discount: float = 1.0, window: int | None = None) -> Selector:
     """UCB1 on increments: mean + `bonus` sqrt(log(n) / n_a); with `discount` or the last `window` blocks alone."""
     arms = regions * strategies
-    progress = _Progress.start(regions)
+    mean = jnp.full(regions, jnp.nan)
     counts, totals = jnp.zeros(arms), jnp.zeros(arms)
     ring = (jnp.full(window or 1, arms), jnp.zeros(window or 1), jnp.zeros((), jnp.int32))
 
     def select(state: Any, *, key: Array) -> tuple[Array, Array]:
         _, counts, totals, _ = state
-        mean = totals / jnp.maximum(counts, 1e-9)
+        worth = totals / jnp.maximum(counts, 1e-9)
         width = bonus * jnp.sqrt(jnp.log(1 + counts.sum()) / jnp.maximum(counts, 1e-9))
-        value = jnp.where(counts < 1e-3, jnp.inf, mean + width)
+        value = jnp.where(counts < 1e-3, jnp.inf, worth + width)
         tie = jax.random.uniform(key, value.shape)
         return _arm(jnp.argmax(jnp.where(value == value.max(), tie, -1.0)), strategies)
 
     def update(state: Any, region: Array, strategy: Array, goals: Array, competences: Array) -> Any:
-        progress, counts, totals, (arms_ring, rewards, at) = state
-        progress, reward = progress.after(region, competences)
+        mean, counts, totals, (arms_ring, rewards, at) = state
+        mean, reward = _increment(mean, region, competences)
         arm = region * strategies + strategy
         if window is not None:
             counts = counts.at[arms_ring[at]].add(-1.0, mode="drop")
@@ -105,15 +105,15 @@ def ucb(regions: int, strategies: int, *, bonus: float, discount: float = 1.0, w
             arms_ring, rewards, at = arms_ring.at[at].set(arm), rewards.at[at].set(reward), (at + 1) % window
         counts = (discount * counts).at[arm].add(1.0)
         totals = (discount * totals).at[arm].add(reward)
-        return progress, counts, totals, (arms_ring, rewards, at)
+        return mean, counts, totals, (arms_ring, rewards, at)
 
-    return Selector((progress, counts, totals, ring), select, update)
+    return Selector((mean, counts, totals, ring), select, update)
 
 
 def exp3(regions: int, strategies: int, *, rate: float, explore: float = 0.1, share: float = 0.0) -> Selector:
     """Exp3, and with `share` > 0 Exp3.S: increments between their 20 % and 80 % quantiles become rewards in [-1, 1]."""
     arms = regions * strategies
-    start = (_Progress.start(regions), jnp.zeros(arms), jnp.zeros(HISTORY), jnp.zeros((), jnp.int32))
+    start = (jnp.full(regions, jnp.nan), jnp.zeros(arms), jnp.zeros(HISTORY), jnp.zeros((), jnp.int32))
 
     def distribution(weights: Array) -> Float[Array, "arms"]:
         return (1 - explore) * jax.nn.softmax(weights) + explore / arms
@@ -122,8 +122,8 @@ def exp3(regions: int, strategies: int, *, rate: float, explore: float = 0.1, sh
         return _arm(jax.random.categorical(key, jnp.log(distribution(state[1]))), strategies)
 
     def update(state: Any, region: Array, strategy: Array, goals: Array, competences: Array) -> Any:
-        progress, weights, history, n = state
-        progress, increment = progress.after(region, competences)
+        mean, weights, history, n = state
+        mean, increment = _increment(mean, region, competences)
         history = history.at[n % HISTORY].set(increment)
         seen = jnp.where(jnp.arange(HISTORY) <= n, history, jnp.nan)
         low, high = jnp.nanquantile(seen, jnp.array([0.2, 0.8]))
@@ -133,25 +133,15 @@ def exp3(regions: int, strategies: int, *, rate: float, explore: float = 0.1, sh
         if share:
             mixed = (1 - share) * jax.nn.softmax(weights) + share / arms
             weights = jnp.log(mixed)
-        return progress, weights - weights.max(), history, n + 1
+        return mean, weights - weights.max(), history, n + 1
 
     return Selector(start, select, update)
 
 
-class _Progress(NamedTuple):
-    """Mean competence of each region in its last block; NaN before the first."""
-
-    mean: Float[Array, "R"]
-
-    @classmethod
-    def start(cls, regions: int) -> _Progress:
-        return cls(jnp.full(regions, jnp.nan))
-
-    def after(self, region: Array, competences: Array) -> tuple[_Progress, Float[Array, ""]]:
-        """The next one, and the increment; 0 in a region's first block."""
-        mean = competences.mean()
-        increment = jnp.where(jnp.isnan(self.mean[region]), 0.0, mean - self.mean[region])
-        return _Progress(self.mean.at[region].set(mean)), increment
+def _increment(mean: Float[Array, "R"], region: Array, competences: Array) -> tuple[Float[Array, "R"], Array]:
+    """Mean competence of each region in its last block after this one, and the increment; 0 where `mean` is NaN yet."""
+    now = competences.mean()
+    return mean.at[region].set(now), jnp.where(jnp.isnan(mean[region]), 0.0, now - mean[region])
 
 
 def _arm(arm: Array, strategies: int) -> tuple[Array, Array]:

@@ -18,8 +18,7 @@ AUTONOMOUS, PROCEDURE, TEACHER, BAD = range(4)
 def run(*, bed=None, costs=(1, 1, 1, 1), absent=(), sign=1.0, seeds=16):
     """The courses of `seeds` learners, [seeds, blocks]; `sign` -1 tells them that they get worse when they learn."""
     bed = bed or beds.six_regions()
-    space = regions.create(bed.space, bed.cuts, max_regions=8)
-    rule = selectors.sgim(sgim.Config(), space, costs, jnp.array([s not in absent for s in range(4)]))
+    rule = selectors.sgim(sgim.Config(), bed.regions, costs, jnp.array([s not in absent for s in range(4)]))
     told = rule._replace(update=lambda state, r, s, goals, c: rule.update(state, r, s, goals, sign * c))
     one = partial(beds.run, bed, told, blocks=BLOCKS, episodes=EPISODES)
     course = jax.jit(jax.vmap(lambda key: one(key=key)))(jax.random.split(jax.random.key(0), seeds))
@@ -65,12 +64,17 @@ def test_a_block_of_the_bed_is_that_of_a_loop():
         np.testing.assert_allclose(course.mastery[i], latent[:4].mean(), rtol=1e-4)
 
 
-def test_the_regions_of_a_bed_are_numbered_as_those_of_the_abstraction():
+def test_goals_are_drawn_in_the_region_that_was_chosen():
     bed = beds.frontier()
-    lower, upper = beds.corners(bed)
-    made = regions.create(bed.space, bed.cuts, max_regions=36)
-    np.testing.assert_allclose(lower, made.lower, atol=1e-6)
-    np.testing.assert_allclose(upper, made.upper, atol=1e-6)
+    told = selectors.Selector(
+        state=jnp.int32(0),
+        select=lambda state, *, key: (state, jnp.int32(0)),
+        update=lambda state, *_: state + 1,
+    )
+    noted = bed._replace(play=lambda latent, r, s, goals, late, *, key: (goals, goals[:, 0]), start=jnp.zeros((5, 2)))
+    course = beds.run(noted._replace(mastery=lambda goals: goals[0, 0]), told, blocks=36, key=jax.random.key(0))
+    located = jax.vmap(jax.vmap(partial(regions.locate, bed.regions)))(course.latent)
+    np.testing.assert_array_equal(located, np.repeat(np.arange(36)[:, None], 5, axis=1))
 
 
 def test_it_practises_what_is_learnable_and_soon_masters_it(quiet):
