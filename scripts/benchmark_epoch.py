@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import envs
 from star import cli, hierarchy, trainer
 from star import forward_model as models
-from star.config import load
+from star.loading import load
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from star import report, trainer
-from star.config import load
+from star.loading import load
 from star.metrics import Journal
 
 

@@ -30,7 +30,8 @@ import numpy as np
 from envs.vector import VectorEnv
 from star import episode, forward_model, hierarchy, trainer
 from star.commander import Decision, Successors
-from star.config import AgentConfig, load
+from star.config import AgentConfig
+from star.loading import load
 from star.reachability import MISSES, REACHES
 from star.state import Spec, TrainState
 

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
-from star.config import Config, ConfigError, fields, parse
+from star.config import Config, ConfigError
+from star.loading import fields, parse
 from star.state import TrainState
 
 FORMAT = 2  # since `refinement.neighbours` and `refinement.parts`

@@ -12,7 +12,8 @@ from typing import Any, NoReturn
 
 import yaml
 
-from star.config import Config, ConfigError, fields, load, parse, read_yaml
+from star.config import Config, ConfigError
+from star.loading import fields, load, parse, read_yaml
 
 _HELP = """\
 Train a three-level agent (Commander, Tutor, Controller) whose goal regions refine themselves.

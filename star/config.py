@@ -1,4 +1,4 @@
-"""Configuration: one YAML file and dotted overrides become one frozen, validated object.
+"""The settings of an experiment: one frozen, validated object. `star.loading` reads it from files.
 
 Every section is a pytree. Its float fields are leaves, everything else is static structure, so the agent's
 sections can be passed through `jax.jit` and batched with `jax.vmap` to train several values of a numeric
@@ -7,16 +7,12 @@ hyperparameter side by side.
 
 from __future__ import annotations
 
-import difflib
-import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self
 
 import jax
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 
 class ConfigError(ValueError):
@@ -369,7 +365,7 @@ class Config(Section):
         return AgentConfig(**{name: getattr(self, name) for name in AgentConfig.model_fields})
 
     def to_yaml(self) -> str:
-        """Every resolved value as YAML that `load` accepts."""
+        """Every resolved value as YAML that `star.loading.load` accepts."""
         return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
 
 
@@ -382,141 +378,3 @@ class AgentConfig(Section):
     abstraction: AbstractionConfig
     forward_model: ForwardModelConfig
     refinement: RefinementConfig
-
-
-def load(path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers: Sequence[str | Path] = ()) -> Config:
-    """Read a YAML file, lay others over it, apply dotted overrides such as `{"tutor.period": 5}` and validate.
-
-    Raises:
-      ConfigError: with one line that names the key, the value and what is allowed.
-
-    """
-    values: dict[str, Any] = {}
-    for file in (path, *layers):
-        values = _merged(values, _read(Path(file)))
-    return parse(values, overrides, source=" with ".join(map(str, (path, *layers))))
-
-
-def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """`below` with what `above` says in its place, section by section; task options are replaced as a whole."""
-    merged = dict(below)
-    for key, value in above.items():
-        old = merged.get(key)
-        if isinstance(old, Mapping) and isinstance(value, Mapping) and key not in ("options", "training"):
-            merged[key] = _merged(old, value)
-        else:
-            merged[key] = value
-    return merged
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        values = read_yaml(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file{_nearest_file(path)}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" line {mark.line + 1} column {mark.column + 1}:" if mark else ""
-        raise ConfigError(f"{path}:{where} not valid YAML: {getattr(error, 'problem', None) or 'bad input'}") from None
-    except (RecursionError, ValueError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
-    if values is None:
-        values = {}
-    if not isinstance(values, dict):
-        raise ConfigError(f"{path}: should hold sections such as `trainer:`, not {_show(values)}")
-    return values
-
-
-class _UniqueKeys(yaml.SafeLoader):
-    """YAML's safe loader, but a key given twice is an error instead of a silent choice of the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, str) and key in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{key} is given twice", key_node.start_mark)
-            seen.add(key if isinstance(key, str) else id(key_node))
-        return super().construct_mapping(node, deep)
-
-
-def read_yaml(text: str) -> Any:
-    """What YAML `text` says; raises `yaml.YAMLError`, `ValueError` or `RecursionError` for what it cannot say."""
-    return yaml.load(text, _UniqueKeys)  # noqa: S506 - a SafeLoader
-
-
-def parse(
-    values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, *, source: str = "configuration"
-) -> Config:
-    """Validate nested `values` after applying dotted `overrides`; raises `ConfigError`."""
-    nested = _with_overrides(values, overrides or {})
-    try:
-        return Config.model_validate(nested)
-    except ValidationError as error:
-        raise ConfigError(f"{source}: {_explain(error.errors()[0])}") from None
-
-
-def fields(section: type[Section] = Config, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
-    """All settings as (dotted key, default, description)."""
-    for name, field in section.model_fields.items():
-        annotation = field.annotation
-        if isinstance(annotation, type) and issubclass(annotation, Section):
-            yield from fields(annotation, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", field.default, field.description or ""
-
-
-def _with_overrides(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
-    nested = {key: dict(value) if isinstance(value, Mapping) else value for key, value in values.items()}
-    for dotted, value in overrides.items():
-        *parents, last = dotted.split(".")
-        level = nested
-        for parent in parents:
-            child = level.get(parent)
-            level[parent] = dict(child) if isinstance(child, Mapping) else {}
-            level = level[parent]
-        level[last] = value
-    return nested
-
-
-def _explain(error: ErrorDetails) -> str:
-    """One pydantic error as one line: key, value, what is allowed."""
-    path = [str(part) for part in error["loc"]]
-    key = ".".join(path)
-    if error["type"] == "extra_forbidden":
-        return f"{key}: unknown key{_nearest_key(path)}"
-    message = error["msg"].removeprefix("Value error, ").replace("Input should be", "should be")
-    message = message[:1].lower() + message[1:]
-    if error["type"] == "value_error" and not isinstance(error["input"], str | int | float | bool):
-        return f"{key}: {message}" if key else message
-    return f"{key}: {_show(error['input'])} is not allowed: {message}" if key else message
-
-
-def _nearest_key(path: Sequence[str]) -> str:
-    """` (did you mean ...?)` with the most similar valid key, looked for in the section and then everywhere."""
-    section: Any = Config
-    for part in path[:-1]:
-        section = section.model_fields[part].annotation
-    matches = difflib.get_close_matches(path[-1], section.model_fields, n=1, cutoff=0.5)
-    if matches:
-        return f" (did you mean {'.'.join([*path[:-1], matches[0]])}?)"
-    everywhere = {key.rsplit(".", 1)[-1]: key for key, _, _ in fields()}
-    matches = difflib.get_close_matches(path[-1], everywhere, n=1, cutoff=0.8)
-    if matches:
-        return f" (did you mean {everywhere[matches[0]]}?)"
-    return f" (allowed: {', '.join(section.model_fields)})"
-
-
-def _nearest_file(path: Path) -> str:
-    if not path.parent.is_dir():
-        return ""
-    names = [entry.name for entry in path.parent.iterdir() if entry.suffix in (".yaml", ".yml")]
-    matches = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
-    return f" (did you mean {path.parent / matches[0]}?)" if matches else ""
-
-
-def _show(value: Any, limit: int = 60) -> str:
-    text = "nan" if isinstance(value, float) and math.isnan(value) else repr(value)
-    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -22,8 +22,9 @@ from envs.vector import VectorEnv
 from star import episode, evaluation, hierarchy, report
 from star import state as states
 from star.checkpoint import Checkpoints, check_compatible
-from star.config import Config, ConfigError, parse
+from star.config import Config, ConfigError
 from star.episode import Episode
+from star.loading import parse
 from star.metrics import Display, Journal, mean
 from star.state import Spec, TrainState
 

@@ -19,7 +19,7 @@ import star.state  # noqa: E402
 from envs import opengl  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
-from star import config, episode, hierarchy  # noqa: E402
+from star import episode, hierarchy, loading  # noqa: E402
 
 settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
 settings.load_profile("star")
@@ -156,7 +156,7 @@ def recording(request, breaking_env):
         "tutor.reward_scale": 0.1,
         "controller.reward_scale": 0.5,
     }
-    parsed = config.parse(TINY, overrides)
+    parsed = loading.parse(TINY, overrides)
     agent, spec = parsed.agent(), star.state.Spec.of(breaking_env.env)
 
     def whole(key):

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import adjacency, config
+from star import adjacency, loading
 
 SPACE = ((-2.0, 0.0), (4.0, 3.5))  # 6 x 4 cells of side 1
 
 
 def settings(**values):
     values = {"enabled": True, "hidden": [32], "features": 4, "batch_size": 64} | values
-    return config.parse({}, {f"tutor.adjacency.{key}": value for key, value in values.items()}).tutor.adjacency
+    return loading.parse({}, {f"tutor.adjacency.{key}": value for key, value in values.items()}).tutor.adjacency
 
 
 @pytest.fixture(scope="module")

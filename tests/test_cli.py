@@ -10,7 +10,8 @@ import pytest
 import envs
 from star import trainer
 from star.cli import main, split_settings
-from star.config import Config, ConfigError, fields
+from star.config import Config, ConfigError
+from star.loading import fields
 
 ROOT = Path(__file__).parents[1]
 

@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import commander, config
+from star import commander, loading
 from star.commander import CommanderState, Decision, Model, Successors
 
 R, N = 5, 40
 
 
 def settings(**values):
-    return config.parse({"commander": values}).commander
+    return loading.parse({"commander": values}).commander
 
 
 def random_batch(seed):

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import pytest
 from pydantic import ValidationError
 
-from star.config import Config, ConfigError, fields, load, parse
+from star.config import Config, ConfigError
+from star.loading import fields, load, parse
 
 DEFAULTS = {key: default for key, default, _ in fields()}
 

@@ -4,11 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import config, controller
+from star import controller, loading
 
 
 def settings(**values):
-    return config.parse({"controller": values}).controller
+    return loading.parse({"controller": values}).controller
 
 
 def test_it_sees_the_state_without_position_then_the_subgoal():

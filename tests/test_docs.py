@@ -10,7 +10,8 @@ import pytest
 from envs.tasks import TASKS
 from star import cli, rendering, trainer
 from star.cli import main
-from star.config import Config, fields, parse
+from star.config import Config
+from star.loading import fields, parse
 
 ROOT = Path(__file__).parents[1]
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("docs/*.md"))}

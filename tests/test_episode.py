@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import envs
 import star.state
 from star import abstraction as regions
-from star import config, episode
+from star import episode, loading
 from star.state import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and the environments of the recording
@@ -210,7 +210,7 @@ def test_dimensions_that_the_goal_leaves_open_keep_the_bounds_of_the_region(tiny
     np.testing.assert_array_equal(spec.abstract(obs), [[1, 2, 5]])
     made = regions.create(spec.space, spec.region_cuts, max_regions=2)
     region = jnp.array([1])
-    box = episode.target_box(config.parse(tiny).agent(), spec, made, region, jnp.array([True]), point)
+    box = episode.target_box(loading.parse(tiny).agent(), spec, made, region, jnp.array([True]), point)
     np.testing.assert_array_equal(box.lower, [[5, 6, 4]])
     np.testing.assert_array_equal(box.upper, [[7, 8, 8]])
 
@@ -232,7 +232,7 @@ def test_the_pose_adds_a_vector_of_the_length_of_the_heading_that_points_where_t
 
 def test_subgoals_with_a_heading_stay_where_they_are_while_the_agent_moves_and_turns(breaking_env, tiny, turning):
     spec = turning
-    agent = config.parse(tiny).agent()
+    agent = loading.parse(tiny).agent()
 
     def rolled(key):
         state = star.state.init(agent, spec, key=key)
@@ -250,7 +250,7 @@ def test_subgoals_with_a_heading_stay_where_they_are_while_the_agent_moves_and_t
 
 @pytest.mark.parametrize("hold", [True, False])
 def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_env, tiny, hold):
-    agent = config.parse(tiny, {"commander.hold": hold}).agent()
+    agent = loading.parse(tiny, {"commander.hold": hold}).agent()
     spec = Spec.of(breaking_env.env)
 
     def commanded(key):

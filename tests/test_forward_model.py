@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import config, forward_model, reachability
+from star import forward_model, loading, reachability
 from star.forward_model import Outcome
 
 SPACE = jnp.array([[-4.0, 0.0], [20.0, 10.0]])
@@ -13,7 +13,7 @@ SPACE = jnp.array([[-4.0, 0.0], [20.0, 10.0]])
 
 def settings(**values):
     values = {"hidden": [8, 6], "batch_size": 16, "buffer_size": 32, "updates_per_epoch": 3} | values
-    return config.parse({"forward_model": values}).forward_model
+    return loading.parse({"forward_model": values}).forward_model
 
 
 def random_outcome(n, seed=0):

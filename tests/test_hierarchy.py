@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import star.state
-from star import config, hierarchy, refinement, replay
+from star import hierarchy, loading, refinement, replay
 from star.replay import Transition
 from star.state import Spec
 
@@ -134,7 +134,7 @@ class Epoch:
 
     def __init__(self, env, values, spec=None):
         self.spec = spec or Spec.of(env.env)
-        self.config = config.parse(values)
+        self.config = loading.parse(values)
         self.traces = 0
 
         def once(agent, state):
@@ -212,7 +212,7 @@ def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(fi
 def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neither(epoch, first, tiny):
     _, state, _ = first
     state, _ = epoch.one(epoch.config.agent(), state)
-    other = config.parse(tiny, {"commander.discount": 0.5, "tutor.reward_scale": 0.3})
+    other = loading.parse(tiny, {"commander.discount": 0.5, "tutor.reward_scale": 0.3})
     epoch.one(other.agent(), state)
     assert epoch.traces == 1
 
@@ -220,7 +220,7 @@ def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neithe
 def test_seeds_and_hyperparameters_train_side_by_side_as_they_would_alone(epoch, tiny):
     agents = [
         epoch.config.agent(),
-        config.parse(tiny, {"controller.reward_scale": 3.0, "commander.epsilon_start": 0.0}).agent(),
+        loading.parse(tiny, {"controller.reward_scale": 3.0, "commander.epsilon_start": 0.0}).agent(),
     ]
     states = [epoch.init(jax.random.key(seed)) for seed in (0, 1)]
     together = epoch.many(stack(*agents), stack(*states))
@@ -277,7 +277,7 @@ def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tin
     if "." in section:
         overrides[f"{section.split('.')[0]}.learner"] = "td3"
     with pytest.raises(ValueError) as caught:
-        star.state.check(config.parse(tiny, overrides), Spec.of(breaking_env.env))
+        star.state.check(loading.parse(tiny, overrides), Spec.of(breaking_env.env))
     assert section in str(caught.value) and "batch_size" in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -312,7 +312,7 @@ LEVELS = {
 @pytest.mark.parametrize("name", LEVELS)
 def test_levels_can_be_left_out(breaking_env, turning, tiny, name):
     """HRAC with subgoals that set a heading, of which adjacency knows nothing."""
-    values = config.parse(tiny, LEVELS[name]).model_dump(mode="json")
+    values = loading.parse(tiny, LEVELS[name]).model_dump(mode="json")
     agent = Epoch(breaking_env, values, turning if name == "hrac" else None)
     start = agent.init(jax.random.key(0))
     end, metrics = agent.one(agent.config.agent(), start)
@@ -328,7 +328,7 @@ def test_levels_can_be_left_out(breaking_env, turning, tiny, name):
 def test_hindsight_makes_what_was_reached_the_subgoal_of_half_of_the_batch(breaking_env, tiny, tutored):
     learner = {"controller.learner": "td3", "controller.hindsight": True, "tutor.enabled": tutored}
     learner |= {"controller.termination_penalty": 3.0}
-    agent, spec = config.parse(tiny, learner).agent(), Spec.of(breaking_env.env)
+    agent, spec = loading.parse(tiny, learner).agent(), Spec.of(breaking_env.env)
     rng = np.random.default_rng(0)
     n, size = 400, 2 if tutored else 4
     reached = rng.normal(size=(n, 2, 2)).astype(np.float32)
@@ -360,7 +360,7 @@ def test_a_termination_costs_its_penalty(recording):
     steps = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.steps)
     paid, less = (
         hierarchy._controller_rollout(
-            config.parse(recording.config.model_dump(), {"controller.termination_penalty": price}).agent(),
+            loading.parse(recording.config.model_dump(), {"controller.termination_penalty": price}).agent(),
             recording.spec,
             steps,
         ).reward

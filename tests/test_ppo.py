@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import config, ppo
+from star import loading, ppo
 from star.replay import Transition
 
 T, B = 6, 8
@@ -13,7 +13,7 @@ T, B = 6, 8
 
 def settings(**values):
     values = {"hidden": [16], "passes": 2, "minibatches": 2} | values
-    return config.parse({"controller": {"ppo": values}, "trainer": {"num_envs": 64}}).controller.ppo
+    return loading.parse({"controller": {"ppo": values}, "trainer": {"num_envs": 64}}).controller.ppo
 
 
 def random_rollout(seed=0):

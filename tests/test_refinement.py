@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from star import abstraction as regions
-from star import config, forward_model, refinement, replay
+from star import forward_model, loading, refinement, replay
 from star.forward_model import Outcome
 from star.reachability import MISSES, REACHES, UNKNOWN, Leaves
 from star.refinement import Goals, Graph, Split
@@ -20,7 +20,7 @@ def settings(**values):
     # `min_width` and the like are traced, so overrides of floats compile nothing.
     model = {"hidden": [4], "buffer_size": 2000}
     values = {f"refinement.{key}": value for key, value in refine.items()} | values
-    return config.parse({"forward_model": model, "abstraction": {"max_regions": R}}, values).agent()
+    return loading.parse({"forward_model": model, "abstraction": {"max_regions": R}}, values).agent()
 
 
 CONFIG = settings()

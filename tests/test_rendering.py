@@ -16,7 +16,8 @@ import envs
 from envs import EnvError, opengl
 from star import cli, rendering, trainer
 from star.checkpoint import Checkpoints
-from star.config import ConfigError, parse
+from star.config import ConfigError
+from star.loading import parse
 from star.rendering import Moments, Show
 
 ROOT = Path(__file__).parents[1]

@@ -9,7 +9,7 @@ import pytest
 
 import star.state
 from envs.arena import Arena
-from star import config
+from star import loading
 from star.commander import Decision
 from star.evaluation import bootstrap
 from star.forward_model import Outcome
@@ -164,7 +164,7 @@ def test_curves_are_drawn(tmp_path):
 def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
     script = load("verify_abstraction")
     spec = Spec.of(breaking_env.env)
-    agent = config.parse(tiny, {"abstraction.cuts": [[8.0], [8.0]]}).agent()
+    agent = loading.parse(tiny, {"abstraction.cuts": [[8.0], [8.0]]}).agent()
     state = star.state.init(agent, spec, key=jax.random.key(0))
     verdict = state.graph.verdict.at[0, 1].set(REACHES).at[1, 0].set(MISSES)
     state = state.replace(graph=state.graph.replace(verdict=verdict))

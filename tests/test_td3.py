@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import config, replay, td3
+from star import replay, td3
 from star.replay import Transition
 
 
@@ -18,7 +18,7 @@ def settings(**values):
         "updates_per_rollout": 1,
         "tau": 0.1,
     } | values
-    return config.parse({"controller": {"learner": "td3", "td3": values}}).controller.td3
+    return loading.parse({"controller": {"learner": "td3", "td3": values}}).controller.td3
 
 
 EXAMPLE = Transition(

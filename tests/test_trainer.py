@@ -20,7 +20,8 @@ import yaml
 
 from star import cli, report, trainer
 from star.checkpoint import Checkpoints
-from star.config import ConfigError, load, parse
+from star.config import ConfigError
+from star.loading import load, parse
 from star.metrics import Journal, JsonLines
 
 ROOT = Path(__file__).parents[1]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import config, tutor
+from star import loading, tutor
 from star.replay import Transition
 from star.tutor import Box, Trace
 
@@ -14,7 +14,7 @@ SCALE = np.array([10.0, 5.0], np.float32)
 
 
 def settings(**values):
-    return config.parse({"tutor": values}).tutor
+    return loading.parse({"tutor": values}).tutor
 
 
 @pytest.mark.parametrize("relative", [True, False])
