@@ -72,8 +72,12 @@ class Arena:
 
     def centres(self, symbols: str) -> np.ndarray:
         """Centres [n, 2] of the cells that hold one of `symbols`, in m."""
+        return np.array([self.centre(cell) for cell in self.cells(symbols)])
+
+    def centre(self, cell: Cell) -> tuple[float, float]:
+        """Centre (x, y) of a cell, in m."""
         row, column = self.origin
-        return np.array([((c - column) * self.cell, (r - row) * self.cell) for r, c in self.cells(symbols)])
+        return ((cell[1] - column) * self.cell, (cell[0] - row) * self.cell)
 
     def walls(self) -> np.ndarray:
         """Merged wall rectangles [n, 4] as (x_lo, y_lo, x_hi, y_hi); they cover the wall cells without overlap."""
@@ -199,9 +203,8 @@ def check(arena: Arena, *, name: str) -> Arena:
 def farthest(arena: Arena) -> tuple[float, float]:
     """Centre (x, y) of the free cell that is the longest walk from the robot's, in m; of several, the last."""
     steps = _walk(arena)
-    r, c = max((cell for cell in steps if arena.rows[cell[0]][cell[1]] == FREE), key=lambda cell: (steps[cell], cell))
-    row, column = arena.origin
-    return ((c - column) * arena.cell, (r - row) * arena.cell)
+    free = (cell for cell in steps if arena.rows[cell[0]][cell[1]] == FREE)
+    return arena.centre(max(free, key=lambda cell: (steps[cell], cell)))
 
 
 def _walk(arena: Arena) -> dict[Cell, int]:

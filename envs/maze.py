@@ -21,7 +21,7 @@ from flax import struct
 
 from envs._quiet import Env, State
 from envs.arena import Arena
-from envs.tasks import Places, Task
+from envs.tasks import Places, Switch, Task
 
 
 class Body(Protocol):
@@ -98,6 +98,7 @@ class MazeEnv(Env):
         """`task` is a row of the registry; the other arguments are options of docs/environments.md."""
         self.name = name
         self.arena: Arena = task.arena
+        self.switch: Switch | None = task.switch
         self.episode_length = episode_length
         self.state_dim = body.state_dim
         self.orientation = body.orientation
