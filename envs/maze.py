@@ -174,6 +174,12 @@ class MazeEnv(Env):
             info={"steps": steps, "truncation": zero, "goal": goal},
         )
 
+    def with_goal(self, state: State, goal: jax.Array) -> State:
+        """`state`, at the start of an episode, with another desired goal [k]."""
+        obs = state.obs.at[self.state_dim :].set(goal)
+        metrics = {**state.metrics, **self._metrics(obs)}
+        return state.replace(obs=obs, metrics=metrics, info={**state.info, "goal": goal})
+
     def step(self, state: State, action: jax.Array) -> State:
         """One env step of `dt` seconds; `action` [action_size] is clipped to [-1, 1]."""
         before = state.pipeline_state

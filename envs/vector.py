@@ -48,6 +48,10 @@ class VectorEnv:
         """New episodes where `mask` (bool [B]) is set; every other environment stays as it is, to the bit."""
         return self._reset_where(state, mask, jax.random.split(rng, self.num_envs))
 
+    def with_goals(self, state: State, goals: jax.Array, mask: jax.Array) -> State:
+        """`state` with the desired goals [B, k] where `mask` (bool [B]) is set, at the start of episodes."""
+        return _select(mask, jax.vmap(self.env.with_goal)(state, goals), state)
+
     def _begin(self, rng: jax.Array) -> State:
         """New episodes, one for each key of `rng` [n]. Each keeps a key of its own for the resets to come."""
         rng, own = jnp.moveaxis(jax.vmap(jax.random.split)(rng), 1, 0)

@@ -58,7 +58,7 @@ def rollouts(
         )
         streams = episode.advance(config, streams)
         finished = hierarchy.finished_period(config, spec, state, streams, steps)
-        return episode.restart_ended(env, streams, steps, key=reset_key), finished
+        return episode.restart_ended(spec, env, streams, steps, key=reset_key), finished
 
     start_key, scan_key = jax.random.split(key)
     streams = episode.start(spec, env, practice=1.0, key=start_key)  # so that targets are regions, never goals

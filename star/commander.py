@@ -67,7 +67,8 @@ class Decision(struct.PyTreeNode):
     """Finished periods of N streams.
 
     `weight` is 1 where the period really lasted k env steps, `lost` is 1 where the task was terminated in it, and
-    `practised` is 1 where a random region was pursued instead of the goal. The reward is that for the goal.
+    `practised` is 1 where a random region was pursued instead of the goal, and `shown` is 1 where a teacher chose the
+    target. The reward is that for the goal.
     """
 
     region: Int[Array, "N"]
@@ -78,6 +79,7 @@ class Decision(struct.PyTreeNode):
     weight: Float[Array, "N"]
     lost: Float[Array, "N"]
     practised: Float[Array, "N"]
+    shown: Float[Array, "N"] | None = None
 
 
 class Successors(struct.PyTreeNode):
@@ -149,12 +151,14 @@ def act(
     goal_region: Int[Array, "B"],
     *,
     practised: Int[Array, "B"] | None = None,
+    attraction: Float[Array, "R"] | None = None,
     epsilon: Float[Array, "B"] | float,
     key: Array,
 ) -> Int[Array, "B"]:
     """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random.
 
-    `practised` are regions to pursue instead of the goal where they are not negative.
+    Random ones are drawn evenly, or in proportion to `attraction`. `practised` are regions to pursue instead of the
+    goal where they are not negative.
     """
     explore_key, random_key, tie_key = jax.random.split(key, 3)
     values = state.q[region, goal_region]
@@ -164,16 +168,30 @@ def act(
     best = jnp.where(allowed.greedy[region], values, -jnp.inf)
     ties = best >= best.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best.shape), -1.0), axis=-1)
-    anything = jnp.where(allowed.explore[region], jax.random.uniform(random_key, best.shape), -1.0)
+    luck = jax.random.uniform(random_key, best.shape)
+    if attraction is not None:  # the largest of u^(1/w) is the one with the weight w in proportion to w
+        luck **= 1 / jnp.maximum(attraction, 1e-6)
+    anything = jnp.where(allowed.explore[region], luck, -1.0)
     exploring = jax.random.uniform(explore_key, region.shape) < epsilon
     return jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
 
 
-def observe(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> CommanderState:
-    """Take in what the streams decided at one instant: a step of Q-learning, or counts for the model."""
+def observe(
+    config: CommanderConfig,
+    state: CommanderState,
+    allowed: Successors,
+    batch: Decision,
+    *,
+    margin: Float[Array, ""] | float = 0.0,
+) -> CommanderState:
+    """Take in what the streams decided at one instant: a step of Q-learning, or counts for the model.
+
+    Q-learning also raises what a teacher chose towards `margin` above all else.
+    """
     state = state.replace(chosen=state.chosen.at[batch.target].add(batch.weight))
     if state.model is None:
-        return _q_learning(config, state, allowed, batch)
+        state = _q_learning(config, state, allowed, batch)
+        return state if batch.shown is None else _follow_teacher(config, state, batch, batch.shown, margin)
     cell = (batch.region, batch.goal_region, batch.target)
     # Who practises and aims at the goal's region aims at its centre, which tells nothing of aiming at the goal.
     telling = batch.weight * (1 - batch.practised * (batch.target == batch.goal_region))
@@ -242,6 +260,25 @@ def _q_learning(config: CommanderConfig, state: CommanderState, allowed: Success
     total = jnp.zeros_like(state.q).at[cell].add(weight * error)
     alpha = 1 - (1 - config.learning_rate) ** visits
     return state.replace(q=state.q + alpha * total / jnp.maximum(visits, 1.0))
+
+
+def _follow_teacher(
+    config: CommanderConfig,
+    state: CommanderState,
+    batch: Decision,
+    shown: Float[Array, "N"],
+    margin: Float[Array, ""] | float,
+) -> CommanderState:
+    """A step of the large-margin loss of DQfD (Hester et al. 2018) on the decisions that were shown."""
+    row = state.q[batch.region, batch.goal_region]
+    chosen = jax.nn.one_hot(batch.target, row.shape[-1])
+    lacking = jnp.max(row + margin * (1 - chosen), axis=-1) - jnp.sum(row * chosen, axis=-1)
+    cell = (batch.region, batch.goal_region, batch.target)
+    shown = batch.weight * shown
+    times = jnp.zeros_like(state.q).at[cell].add(shown)
+    total = jnp.zeros_like(state.q).at[cell].add(shown * lacking)
+    alpha = 1 - (1 - config.learning_rate) ** times
+    return state.replace(q=state.q + alpha * total / jnp.maximum(times, 1.0))
 
 
 def _td_error(

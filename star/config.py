@@ -314,6 +314,69 @@ class SelectionConfig(Section):
         return self
 
 
+class TeacherConfig(Section):
+    """One teacher: demonstrations, what they are used for, and what it takes to ask."""
+
+    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")] = Field(description="in metrics and figures")
+    kind: Literal["action", "outcome", "decomposition"] = Field(
+        description="what is shown: movements to imitate, outcomes to aim at, or routes to a goal"
+    )
+    source: str = Field("map", description="file of demonstrations (.npz), or map: shortest paths, routes only")
+    flaw: Literal["repetitive", "wrong_half", "other_body"] | None = Field(
+        None, description="what makes it a poor teacher, for experiments"
+    )
+    cost: float = Field(1.0, gt=0, description="of an episode, relative to one alone")
+    availability: float = Field(1.0, ge=0, le=1, description="share of epochs in which the teacher is there")
+    max_queries: Positive | None = Field(None, description="episodes that may be asked for; null: any number")
+
+
+class SgimConfig(Section):
+    """SGIM in the trainer: intrinsic motivation chooses goals, strategies, teachers, targets and what to examine."""
+
+    goals: bool = Field(False, description="training goals are chosen by progress, instead of drawn as the task says")
+    strategies: tuple[Literal["autonomous", "babbling", "decomposition"], ...] = Field(
+        ("autonomous",),
+        min_length=1,
+        description="ways to practise alone: as ever, by random subgoals, or via a region",
+    )
+    teachers: tuple[TeacherConfig, ...] = Field((), description="teachers that may be asked for help")
+    ask: Literal["progress", "evenly"] = Field(
+        "progress", description="which strategy: by progress over cost, or each as often, as in SGIM-D"
+    )
+    exploration: bool = Field(False, description="the Commander's random targets are drawn by progress")
+    refinement: bool = Field(False, description="examine first what is half mastered and makes no progress")
+    margin: float = Field(0.0, ge=0, description="learner q: what a teacher's choice is to be better by than others")
+    imitation: float = Field(
+        1.0, ge=0, description="weight of demonstrated actions in the loss of the Controller's actor"
+    )
+    imitation_batch: Positive = Field(256, description="demonstrated actions in each of its updates")
+    selection: SelectionConfig = SelectionConfig()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All strategies: those alone, then the teachers."""
+        return (*self.strategies, *(teacher.name for teacher in self.teachers))
+
+    @property
+    def enabled(self) -> bool:
+        """Whether anything is left to intrinsic motivation."""
+        return self.goals or self.exploration or self.refinement or self.names != ("autonomous",)
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Self:
+        twice = next((name for i, name in enumerate(self.names) if name in self.names[:i]), None)
+        if twice:
+            raise ValueError(f"{twice} is given twice among strategies and teachers")
+        return self
+
+    @model_validator(mode="after")
+    def _maps_show_routes(self) -> Self:
+        for teacher in self.teachers:
+            if teacher.source == "map" and teacher.kind != "decomposition":
+                raise ValueError(f"teacher {teacher.name}: source map shows routes only; allowed: kind decomposition")
+        return self
+
+
 class TrainerConfig(Section):
     """The host loop around the jitted epoch."""
 
@@ -338,6 +401,7 @@ class Config(Section):
     abstraction: AbstractionConfig = AbstractionConfig()
     forward_model: ForwardModelConfig = ForwardModelConfig()
     refinement: RefinementConfig = RefinementConfig()
+    sgim: SgimConfig = SgimConfig()
     trainer: TrainerConfig = TrainerConfig()
 
     @model_validator(mode="after")
@@ -353,6 +417,15 @@ class Config(Section):
                     f"{name}.ppo.minibatches: {section.ppo.minibatches} does not divide the rollout of {rollout} "
                     f"decisions ({decisions} of each of {self.trainer.num_envs} environments)"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _strategies_need_levels(self) -> Self:
+        if "babbling" in self.sgim.strategies and not self.tutor.enabled:
+            raise ValueError("sgim.strategies: babbling needs tutor.enabled, whose subgoals it replaces")
+        routes = [teacher.name for teacher in self.sgim.teachers if teacher.kind == "decomposition"]
+        if not self.commander.enabled and ("decomposition" in self.sgim.strategies or routes):
+            raise ValueError("sgim: decomposition needs commander.enabled, whose targets it sets")
         return self
 
     def learners(self) -> list[tuple[str, LevelConfig, int]]:
@@ -378,3 +451,4 @@ class AgentConfig(Section):
     abstraction: AbstractionConfig
     forward_model: ForwardModelConfig
     refinement: RefinementConfig
+    sgim: SgimConfig

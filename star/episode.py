@@ -25,6 +25,8 @@ from star import commander, controller, learner, tutor
 from star.abstraction import Abstraction
 from star.commander import Successors
 from star.config import AgentConfig
+from star.sgim import strategies
+from star.sgim.strategies import Lesson
 from star.state import Spec, TrainState
 from star.tutor import Box
 
@@ -45,6 +47,7 @@ class Streams(struct.PyTreeNode):
     start: Float[Array, "B d"]
     reward: Float[Array, "B"]
     episode: Episode
+    lesson: Lesson | None = None
 
 
 class Episode(struct.PyTreeNode):
@@ -164,14 +167,24 @@ def command(
     obs = streams.env.obs
     locate = jax.vmap(partial(regions.locate, state.abstraction))
     region, goal_region = locate(spec.abstract(obs)), locate(spec.goal_point(obs))
-    target, practice = goal_region, streams.practice
+    target, practice, lesson = goal_region, streams.practice, streams.lesson
     if config.commander.enabled:
         act_key, practice_key = jax.random.split(key)
         another = jax.random.randint(practice_key, practice.shape, 0, state.abstraction.count)
         practice = jnp.where((practice == region) | (practice == _ANY), another, practice)
         target = commander.act(
-            state.commander, allowed, region, goal_region, practised=practice, epsilon=epsilon, key=act_key
+            state.commander,
+            allowed,
+            region,
+            goal_region,
+            practised=practice,
+            attraction=None if state.sgim is None else strategies.attraction(config.sgim, state.sgim),
+            epsilon=epsilon,
+            key=act_key,
         )
+        if lesson is not None:
+            lesson, imposed = strategies.impose(lesson, state.abstraction, region)
+            target = jnp.where(imposed >= 0, imposed, target)
         if config.commander.hold:
             there = (streams.env.metrics["success"] > 0) & (practice < 0)
             target = jnp.where(there, goal_region, target)
@@ -187,6 +200,7 @@ def command(
         start=spec.abstract(obs),
         reward=jnp.full_like(streams.reward, commander.start_reward(config.commander)),
         episode=streams.episode,
+        lesson=lesson,
     )
     return _select(streams.clock == 0, fresh, streams)
 
@@ -216,6 +230,9 @@ def choose_subgoal(
         return jnp.concatenate([streams.box.lower - position, streams.box.upper - position], axis=-1), None
     seen = tutor.observe(config.tutor, spec.state(obs), position, streams.box)
     action = learner.act(config.tutor, state.tutor, seen, deterministic=deterministic, key=key)
+    if streams.lesson is not None and "babbling" in config.sgim.strategies:
+        anything = jax.random.uniform(jax.random.fold_in(key, 1), action.shape, minval=-1.0)
+        action = jnp.where(strategies.babbles(config.sgim, streams.lesson)[:, None], anything, action)
     return tutor.subgoal(action, spec.scale), action
 
 
@@ -271,12 +288,25 @@ def advance(config: AgentConfig, streams: Streams) -> Streams:
     return streams.replace(clock=(streams.clock + config.tutor.period) % config.commander.period)
 
 
-def restart_ended(env: VectorEnv, streams: Streams, steps: Steps, *, key: Array) -> Streams:
-    """Reset the environments that ended early in this segment, with clocks and statistics at their start."""
+def restart_ended(spec: Spec, env: VectorEnv, streams: Streams, steps: Steps, *, key: Array) -> Streams:
+    """Reset the environments that ended early in this segment, with clocks and statistics at their start.
+
+    What SGIM has chosen for them holds again, from its beginning.
+    """
     ended = jnp.max(steps.ended * steps.alive, axis=0) > 0
     env_state = env.reset_where(streams.env, ended, key)
+    if streams.lesson is not None:
+        lesson = strategies.grade(streams.lesson, ended, streams.episode.distance, radius=spec.success_radius)
+        env_state = pursue(spec, env, env_state, lesson, ended)
+        streams = streams.replace(lesson=lesson.replace(leg=jnp.where(ended, lesson.first, lesson.leg)))
     restarted = streams.replace(clock=jnp.zeros_like(streams.clock), episode=Episode.start(env.num_envs), env=env_state)
     return _select(ended, restarted, streams.replace(env=env_state))
+
+
+def pursue(spec: Spec, env: VectorEnv, env_state: EnvState, lesson: Lesson, mask: Bool[Array, "B"]) -> EnvState:
+    """`env_state` with the goals of the lesson where it is `taught` and an episode has just begun (`mask`)."""
+    goals = spec.with_goal_point(spec.goal(env_state.obs), lesson.choice.goal)
+    return env.with_goals(env_state, goals, mask & lesson.taught)
 
 
 def _record(episode: Episode, env_state: EnvState, alive: Float[Array, "B"]) -> Episode:

@@ -16,6 +16,7 @@ last k steps.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -30,26 +31,37 @@ from star.commander import CommanderState, Decision, Successors
 from star.config import AgentConfig
 from star.episode import Episode, Steps, Streams
 from star.forward_model import Outcome
-from star.replay import Penalty, Transition
+from star.replay import Imitation, Penalty, Transition
+from star.sgim import selection, strategies
+from star.sgim.selection import SgimState
+from star.sgim.strategies import Lesson
+from star.sgim.teachers import Demonstrations
 from star.state import Spec, TrainState
 from star.tutor import Trace
 
 Metrics = dict[str, Array]
 
 
-def epoch(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState) -> tuple[TrainState, Metrics]:
-    """One episode of all environments, its updates, one refinement."""
+def epoch(
+    config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, teachers: Sequence[Demonstrations] = ()
+) -> tuple[TrainState, Metrics]:
+    """One episode of all environments, its updates, one refinement. `teachers` are those of `config.sgim.teachers`."""
     key, reset_key, scan_key, end_key = jax.random.split(state.key, 4)
     streams = episode.start(spec, env, practice=commander.practice(config.commander), key=reset_key)
+    if config.sgim.enabled:
+        streams = _begin_lesson(config, spec, env, state, teachers, streams, key=jax.random.fold_in(reset_key, 1))
     segments = spec.episode_length // config.tutor.period
     blocks = (segments // config.tutor.unroll, config.tutor.unroll)
     (state, streams), (outcomes, metrics, counts) = jax.lax.scan(
-        partial(_block, config, spec, env),
+        partial(_block, config, spec, env, teachers),
         (state.replace(key=key), streams),
         (jax.random.split(scan_key, blocks[0]), jnp.arange(segments).reshape(blocks)),
     )
     metrics = jax.tree.map(jnp.mean, metrics) | jax.tree.map(jnp.sum, counts)
     metrics |= _episode_metrics("train", streams.episode, streams.practice < 0)
+    if config.sgim.enabled:
+        state, more = _end_lesson(config, spec, state, streams)
+        metrics |= _prefix("sgim", more)
     if state.adjacency is not None:
         end_key, near_key = jax.random.split(end_key)
         near, more = adjacency.train(config.tutor.adjacency, state.adjacency, spec.space, key=near_key)
@@ -62,13 +74,89 @@ def epoch(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState) ->
     return state.replace(epoch=state.epoch + 1), metrics
 
 
+def _begin_lesson(
+    config: AgentConfig,
+    spec: Spec,
+    env: VectorEnv,
+    state: TrainState,
+    teachers: Sequence[Demonstrations],
+    streams: Streams,
+    *,
+    key: Array,
+) -> Streams:
+    """Let SGIM choose goals, strategies and teachers of the environments that do not practise."""
+    assert state.sgim is not None
+    obs = streams.env.obs
+    lesson = strategies.assign(
+        config.sgim,
+        state.sgim,
+        teachers,
+        start=spec.abstract(obs),
+        goal=spec.goal_point(obs),
+        taught=streams.practice < 0,
+        key=key,
+    )
+    env_state = episode.pursue(spec, env, streams.env, lesson, jnp.ones_like(lesson.taught))
+    lesson = strategies.begin(lesson, env_state.metrics["distance"], radius=spec.success_radius)
+    return streams.replace(env=env_state, lesson=lesson)
+
+
+def _end_lesson(config: AgentConfig, spec: Spec, state: TrainState, streams: Streams) -> tuple[TrainState, Metrics]:
+    """Let SGIM learn from the epoch."""
+    lesson = streams.lesson
+    assert lesson is not None
+    assert state.sgim is not None
+    over = jnp.ones_like(lesson.taught)
+    lesson = strategies.grade(lesson, over, streams.episode.distance, radius=spec.success_radius)
+    learnt, metrics = strategies.learn(config.sgim, state.sgim, lesson)
+    return state.replace(sgim=learnt), metrics
+
+
+def _imitation(
+    config: AgentConfig, spec: Spec, teachers: Sequence[Demonstrations], lesson: Lesson | None, *, key: Array
+) -> Imitation | None:
+    """Demonstrated actions, as steps towards where the demonstrator was at the end of their segment.
+
+    Without a Tutor they are steps towards the box around the demonstrated outcome.
+    """
+    batches = []
+    for number, (teacher, demos) in enumerate(zip(config.sgim.teachers, teachers, strict=True)):
+        if lesson is None or teacher.kind != "action":
+            continue
+        drawn = strategies.shown(
+            demos, config.tutor.period, size=config.sgim.imitation_batch, key=jax.random.fold_in(key, number)
+        )
+        position = spec.abstract(drawn.state)
+        subgoal = spec.pose(drawn.later) - spec.pose(drawn.state)
+        if not config.tutor.enabled:
+            margin = config.commander.goal_margin
+            corners = drawn.outcome - margin, drawn.outcome + margin
+            subgoal = jnp.concatenate([corner - position for corner in corners], axis=-1)
+        share = strategies.mimicking(config.sgim, lesson, number)
+        batches.append(
+            Imitation(
+                obs=controller.observe(drawn.state, subgoal, position=spec.abstract_indices),
+                action=drawn.action,
+                weight=jnp.full(len(position), config.sgim.imitation * share),
+            )
+        )
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), *batches) if batches else None
+
+
 def _block(
-    config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], inputs: tuple[Array, Array]
+    config: AgentConfig,
+    spec: Spec,
+    env: VectorEnv,
+    teachers: Sequence[Demonstrations],
+    carry: tuple[TrainState, Streams],
+    inputs: tuple[Array, Array],
 ) -> tuple[tuple[TrainState, Streams], tuple[Any, Metrics, Metrics]]:
     """`tutor.unroll` segments, whose numbers are given, then one update of the Tutor."""
     scan_key, update_key = jax.random.split(inputs[0])
     carry, (decisions, outcomes, metrics, counts) = jax.lax.scan(
-        partial(_segment, config, spec, env), carry, (jax.random.split(scan_key, config.tutor.unroll), inputs[1])
+        partial(_segment, config, spec, env, teachers),
+        carry,
+        (jax.random.split(scan_key, config.tutor.unroll), inputs[1]),
     )
     state, streams = carry
     metrics = jax.tree.map(jnp.mean, metrics)
@@ -87,7 +175,12 @@ def _block(
 
 
 def _segment(
-    config: AgentConfig, spec: Spec, env: VectorEnv, carry: tuple[TrainState, Streams], inputs: tuple[Array, Array]
+    config: AgentConfig,
+    spec: Spec,
+    env: VectorEnv,
+    teachers: Sequence[Demonstrations],
+    carry: tuple[TrainState, Streams],
+    inputs: tuple[Array, Array],
 ) -> tuple[tuple[TrainState, Streams], tuple[Transition | None, Any, Metrics, Metrics]]:
     """One decision of the Tutor: command, act, roll out, let Controller and Commander learn."""
     state, streams = carry
@@ -105,7 +198,12 @@ def _segment(
     experience = _controller_rollout(config, spec, steps)
     in_hindsight = partial(_in_hindsight, config, spec) if config.controller.hindsight else None
     controller_state, controller_metrics = learner.update(
-        config.controller, state.controller, experience, relabel=in_hindsight, key=update_key
+        config.controller,
+        state.controller,
+        experience,
+        relabel=in_hindsight,
+        imitation=_imitation(config, spec, teachers, streams.lesson, key=update_key),
+        key=update_key,
     )
     metrics = _prefix("controller", controller_metrics | {"reward": _weighted(experience.reward, experience.weight)})
     streams = episode.advance(config, streams)
@@ -128,7 +226,7 @@ def _segment(
             ("overflow", steps.overflow),
         )
     }
-    streams = episode.restart_ended(env, streams, steps, key=reset_key)
+    streams = episode.restart_ended(spec, env, streams, steps, key=reset_key)
     return (state.replace(controller=controller_state), streams), (transition, (decision, outcome), metrics, counts)
 
 
@@ -136,7 +234,7 @@ def _command_better(
     config: AgentConfig, spec: Spec, state: TrainState, allowed: Successors, decision: Decision, number: Array
 ) -> CommanderState:
     """The Commander after the decisions that ended with segment `number` of the episode."""
-    learnt = commander.observe(config.commander, state.commander, allowed, decision)
+    learnt = commander.observe(config.commander, state.commander, allowed, decision, margin=config.sgim.margin)
     if learnt.model is None:
         return learnt
 
@@ -190,15 +288,27 @@ def refine(
 ) -> tuple[TrainState, Metrics]:
     """Examine pairs, cut regions, and let the tables that regions index follow every cut."""
     abstraction, graph, splits, metrics = refinement.refine(
-        config, state.abstraction, state.graph, state.forward_model, goals, radius=spec.success_radius, key=key
+        config,
+        state.abstraction,
+        state.graph,
+        state.forward_model,
+        goals,
+        radius=spec.success_radius,
+        weight=1.0 if state.sgim is None else strategies.urgency(config.sgim, state.sgim),
+        key=key,
     )
+    Tables = tuple[CommanderState, SgimState | None]
 
-    def follow(commander_state: CommanderState, split: refinement.Split) -> tuple[CommanderState, None]:
-        after = commander.on_split(commander_state, parent=split.parent, child=split.child)
-        return regions.where(split.done, after, commander_state), None
+    def follow(tables: Tables, split: refinement.Split) -> tuple[Tables, None]:
+        ours, known = tables
+        after = commander.on_split(ours, parent=split.parent, child=split.child)
+        if known is not None:
+            parts, _ = regions.split(known.abstraction, split.cut, min_width=0.0)
+            known = selection.on_split(config.sgim.selection, known, parts, parent=split.parent, child=split.child)
+        return regions.where(split.done, (after, known), tables), None
 
-    commander_state, _ = jax.lax.scan(follow, state.commander, splits)
-    return state.replace(abstraction=abstraction, graph=graph, commander=commander_state), metrics
+    (commander_state, known), _ = jax.lax.scan(follow, (state.commander, state.sgim), splits)
+    return state.replace(abstraction=abstraction, graph=graph, commander=commander_state, sgim=known), metrics
 
 
 def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transition:
@@ -259,6 +369,9 @@ def _tutor_transition(
         swap = partial(jnp.swapaxes, axis1=0, axis2=1)
         extras = Trace(states=swap(spec.state(steps.obs)), actions=swap(steps.action), achieved=swap(achieved))
     end = steps.next_obs[-1]
+    weight = jnp.ones_like(terminated)
+    if streams.lesson is not None:
+        weight *= ~strategies.babbles(config.sgim, streams.lesson)
     return Transition(
         obs=observe(spec.state(began), spec.abstract(began), streams.box),
         action=action,
@@ -266,7 +379,7 @@ def _tutor_transition(
         next_obs=observe(spec.state(end), spec.abstract(end), streams.box),
         terminated=terminated,
         cut=jnp.maximum(streams.clock == 0, ended) if config.commander.enabled else ended,
-        weight=jnp.ones_like(terminated),
+        weight=weight,
         extras=extras,
     )
 
@@ -276,6 +389,7 @@ def finished_period(
 ) -> tuple[Decision, Outcome]:
     """The Commander's decisions that came to their end with this segment; weight 0 elsewhere."""
     end = spec.abstract(steps.next_obs[-1])
+    lesson = streams.lesson
     whole_segment = steps.alive[-1] * (1 - steps.ended[-1])
     weight = jnp.where(streams.clock == 0, whole_segment, 0.0)
     decision = Decision(
@@ -287,6 +401,7 @@ def finished_period(
         weight=weight,
         lost=jnp.max(steps.terminated * steps.alive, axis=0),
         practised=(streams.practice >= 0).astype(weight.dtype),
+        shown=None if lesson is None else strategies.guided(config.sgim, lesson).astype(weight.dtype),
     )
     outcome = Outcome(start=streams.start, lower=streams.box.lower, upper=streams.box.upper, end=end, weight=weight)
     return decision, outcome

@@ -7,7 +7,8 @@ A learner is a module with three functions:
     update(config, state, rollout, *, key)                -> state, metrics
 
 `update` sees a rollout [T, B] of `star.replay.Transition`. An off-policy learner also takes `relabel`, applied to
-every batch it replays. Every learner takes `penalty`, which prices the actor's action in a transition.
+every batch it replays. Every learner takes `penalty`, which prices the actor's action in a transition, and
+`imitation`, actions of somebody else to come near to.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from jaxtyping import Array, Float
 
 from star import ppo, td3
 from star.config import LevelConfig
-from star.replay import Penalty, Transition
+from star.replay import Imitation, Penalty, Transition
 
 State = ppo.PPOState | td3.TD3State
 Metrics = dict[str, Array]
@@ -47,9 +48,10 @@ def update(
     *,
     relabel: td3.Relabel | None = None,
     penalty: Penalty | None = None,
+    imitation: Imitation | None = None,
     key: Array,
 ) -> tuple[Any, Metrics]:
     """Learn from a rollout [T, B]; `relabel` is used by learners that replay old transitions."""
     if config.learner == "ppo":
-        return ppo.update(config.ppo, state, rollout, penalty=penalty, key=key)
-    return td3.update(config.td3, state, rollout, relabel=relabel, penalty=penalty, key=key)
+        return ppo.update(config.ppo, state, rollout, penalty=penalty, imitation=imitation, key=key)
+    return td3.update(config.td3, state, rollout, relabel=relabel, penalty=penalty, imitation=imitation, key=key)

@@ -6,7 +6,7 @@ import difflib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import yaml
 from pydantic import ValidationError
@@ -129,7 +129,8 @@ def _nearest_key(path: Sequence[str]) -> str:
     """` (did you mean ...?)` with the most similar valid key, looked for in the section and then everywhere."""
     section: Any = Config
     for part in path[:-1]:
-        section = section.model_fields[part].annotation
+        # of a list of sections the index comes next
+        section = get_args(section)[0] if part.isdigit() else section.model_fields[part].annotation
     matches = difflib.get_close_matches(path[-1], section.model_fields, n=1, cutoff=0.5)
     if matches:
         return f" (did you mean {'.'.join([*path[:-1], matches[0]])}?)"

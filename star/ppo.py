@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 
 from star.config import PPOConfig
 from star.networks import MLP, Normalizer, apply
-from star.replay import Penalty, Transition, flatten
+from star.replay import Imitation, Penalty, Transition, flatten
 
 Metrics = dict[str, Array]
 
@@ -87,19 +87,28 @@ def act(
 
 
 def update(
-    config: PPOConfig, state: PPOState, rollout: Transition, *, penalty: Penalty | None = None, key: Array
+    config: PPOConfig,
+    state: PPOState,
+    rollout: Transition,
+    *,
+    penalty: Penalty | None = None,
+    imitation: Imitation | None = None,
+    key: Array,
 ) -> tuple[PPOState, Metrics]:
     """Learn from one rollout [T, B] that `state` itself has collected.
 
-    `penalty(batch, action)` [N] is added to the loss of the actor whose mean is `action`.
+    `penalty(batch, action)` [N] is added to the loss of the actor whose mean is `action`, and so is that of
+    `imitation`.
     """
     samples = _prepare(config, state, rollout, keep=penalty is not None)
+    if imitation is not None:
+        imitation = imitation.replace(obs=state.normalizer(imitation.obs))
 
     def one_pass(carry: tuple, pass_key: Array) -> tuple[tuple, Metrics]:
         params, optimizer, learning_rate = carry
         batches = _minibatches(samples, config.minibatches, key=pass_key)
         (params, optimizer), metrics = jax.lax.scan(
-            partial(_gradient_step, config, penalty, learning_rate), (params, optimizer), batches
+            partial(_gradient_step, config, penalty, imitation, learning_rate), (params, optimizer), batches
         )
         metrics = jax.tree.map(jnp.mean, metrics)
         return (params, optimizer, _adapt(config, learning_rate, metrics["kl"])), metrics
@@ -176,17 +185,26 @@ def _minibatches(samples: _Sample, count: int, *, key: Array) -> _Sample:
 
 
 def _gradient_step(
-    config: PPOConfig, penalty: Penalty | None, learning_rate: Array, carry: tuple, batch: _Sample
+    config: PPOConfig,
+    penalty: Penalty | None,
+    imitation: Imitation | None,
+    learning_rate: Array,
+    carry: tuple,
+    batch: _Sample,
 ) -> tuple[tuple, Metrics]:
     params, optimizer = carry
-    gradient, metrics = jax.grad(partial(_loss, config, penalty), has_aux=True)(params, batch)
+    gradient, metrics = jax.grad(partial(_loss, config, penalty, imitation), has_aux=True)(params, batch)
     step, optimizer = _optimizer(config).update(gradient, optimizer)
     params = jax.tree.map(lambda p, s: p - learning_rate * s, params, step)
     return (params, optimizer), metrics
 
 
 def _loss(
-    config: PPOConfig, penalty: Penalty | None, params: Mapping[str, Any], batch: _Sample
+    config: PPOConfig,
+    penalty: Penalty | None,
+    imitation: Imitation | None,
+    params: Mapping[str, Any],
+    batch: _Sample,
 ) -> tuple[Array, Metrics]:
     share = batch.weight / jnp.maximum(batch.weight.sum(), 1.0)
     centred = batch.advantage - jnp.sum(share * batch.advantage)
@@ -198,6 +216,8 @@ def _loss(
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
     price = 0.0 if penalty is None or batch.transition is None else penalty(batch.transition, mean)
     actor_loss = jnp.sum(share * (price - jnp.minimum(ratio * advantage, clipped * advantage)))
+    if imitation is not None:
+        actor_loss += imitation.loss(_policy(config, params, imitation.obs)[0])
     critic_loss = 0.5 * jnp.sum(share * jnp.square(_value(config, params, batch.obs) - batch.target))
     entropy = jnp.sum(jnp.log(std)) + 0.5 * std.shape[0] * jnp.log(2 * jnp.pi * jnp.e)
     metrics = {

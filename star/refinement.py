@@ -180,11 +180,16 @@ def random_cut(abstraction: Abstraction, region: Int[Array, ""], *, min_width: f
 
 
 class Split(struct.PyTreeNode):
-    """A cut that was made (`done`) or not: the region it cut and the region that is new."""
+    """A cut that was made (`done`) or not, and the region that is new by it."""
 
     done: Bool[Array, ""]
-    parent: Int[Array, ""]
+    cut: Cut
     child: Int[Array, ""]
+
+    @property
+    def parent(self) -> Int[Array, ""]:
+        """The region that was cut."""
+        return self.cut.region
 
 
 def refine(
@@ -195,11 +200,13 @@ def refine(
     goals: Goals,
     *,
     radius: float | Array,
+    weight: Float[Array, "R"] | float = 1.0,
     key: Array,
 ) -> tuple[Abstraction, Graph, Split, Metrics]:
     """Examine the due pairs of one epoch, at most `pairs_per_epoch`, and cut where a verdict is mixed.
 
-    `radius` is that of success around goals. Returns the splits in the order made, stacked
+    `radius` is that of success around goals. Of the due pairs, those commanded most and waiting longest come first;
+    `weight` multiplies the urgency of those that lead to each region. Returns the splits in the order made, stacked
     [pairs_per_epoch * cuts_per_pair], for tables indexed by region.
     """
     graph = forget(config, graph)
@@ -208,7 +215,7 @@ def refine(
     def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
         abstraction, graph = carry
         waiting = due(config, graph, abstraction.active)
-        urgency = graph.transitions * (1 + graph.age)
+        urgency = graph.transitions * (1 + graph.age) * weight
         region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, urgency, -1.0)), waiting.shape)
         found = waiting[region, target]
         inside = region == target
@@ -341,9 +348,7 @@ def _cut(
             cut = random_cut(abstraction, cut.region, min_width=min_width, key=cut_key)
         child = abstraction.count
         after, possible = regions.split(abstraction, cut, min_width=min_width)
-        split = Split(
-            done=mixed & possible & (gain > 1e-6), parent=cut.region, child=jnp.minimum(child, parts.shape[0] - 1)
-        )
+        split = Split(done=mixed & possible & (gain > 1e-6), cut=cut, child=jnp.minimum(child, parts.shape[0] - 1))
         abstraction = regions.where(split.done, after, abstraction)
         parts = parts.at[split.child].set(parts[split.child] | split.done)
         return (abstraction, on_split(graph, split), parts), split

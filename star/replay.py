@@ -34,6 +34,18 @@ class Transition(struct.PyTreeNode):
     extras: Any = ()
 
 
+class Imitation(struct.PyTreeNode):
+    """Actions that were demonstrated, for the actor's mean to come near: mean of weight * ||mean(o) - a||^2 / 2."""
+
+    obs: Float[Array, "M obs"]
+    action: Float[Array, "M act"]
+    weight: Float[Array, "M"]
+
+    def loss(self, mean: Float[Array, "M act"]) -> Float[Array, ""]:
+        """What is added to the actor's loss; `mean` is what it would do on `obs`."""
+        return 0.5 * jnp.mean(self.weight * jnp.sum(jnp.square(mean - self.action), axis=-1))
+
+
 Penalty = Callable[[Transition, Array], Array]
 """The price [N] of actions [N, act] that an actor would take in a batch of transitions."""
 

@@ -22,6 +22,8 @@ from star.config import AgentConfig, Config
 from star.forward_model import ForwardModelState
 from star.refinement import Graph
 from star.replay import Transition
+from star.sgim import strategies
+from star.sgim.selection import SgimState
 from star.tutor import Trace
 
 
@@ -96,6 +98,16 @@ class Spec:
         ]
         return jnp.stack(columns, axis=-1)
 
+    def with_goal_point(
+        self, goal: Float[Array, "*batch goal"], point: Float[Array, "*batch d"]
+    ) -> Float[Array, "*batch goal"]:
+        """The task goal at an abstract `point`; what is not abstract in it stays as in `goal`."""
+        columns = [
+            point[..., self.abstract_indices.index(i)] if i in self.abstract_indices else goal[..., column]
+            for column, i in enumerate(self.goal_indices)
+        ]
+        return jnp.stack(columns, axis=-1)
+
     def in_goal(self) -> Bool[Array, "d"]:
         """Which abstract dimensions g* fixes."""
         return jnp.asarray([i in self.goal_indices for i in self.abstract_indices])
@@ -111,6 +123,7 @@ class TrainState(struct.PyTreeNode):
     abstraction: Abstraction
     graph: Graph
     forward_model: ForwardModelState
+    sgim: SgimState | None
     epoch: Int[Array, ""]
     key: Array
 
@@ -129,6 +142,7 @@ def init(config: AgentConfig, spec: Spec, *, key: Array) -> TrainState:
         abstraction=abstraction,
         graph=refinement.init(capacity=abstraction.capacity),
         forward_model=forward_model.init(model_key, config.forward_model, space=abstraction.space),
+        sgim=strategies.init(config.sgim, abstraction),
         epoch=jnp.zeros((), jnp.int32),
         key=key,
     )

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from star import replay
 from star.config import TD3Config
 from star.networks import MLP, apply
-from star.replay import Penalty, Transition, flatten
+from star.replay import Imitation, Penalty, Transition, flatten
 
 Metrics = dict[str, Array]
 Relabel = Callable[[Transition, Array], Transition]
@@ -91,21 +91,30 @@ def update(
     *,
     relabel: Relabel | None = None,
     penalty: Penalty | None = None,
+    imitation: Imitation | None = None,
     key: Array,
 ) -> tuple[TD3State, Metrics]:
     """Store one rollout [T, B] and make `updates_per_rollout` updates, on batches passed through `relabel`.
 
-    `penalty(batch, action)` [N] is added to the loss of the actor that would take `action`.
+    `penalty(batch, action)` [N] is added to the loss of the actor that would take `action`, and so is that of
+    `imitation`.
     """
     state = state.replace(ring=replay.add(state.ring, flatten(rollout)))
     state, metrics = jax.lax.scan(
-        partial(_one_update, config, relabel, penalty), state, jax.random.split(key, config.updates_per_rollout)
+        partial(_one_update, config, relabel, penalty, imitation),
+        state,
+        jax.random.split(key, config.updates_per_rollout),
     )
     return state, jax.tree.map(jnp.mean, metrics)
 
 
 def _one_update(
-    config: TD3Config, relabel: Relabel | None, penalty: Penalty | None, state: TD3State, key: Array
+    config: TD3Config,
+    relabel: Relabel | None,
+    penalty: Penalty | None,
+    imitation: Imitation | None,
+    state: TD3State,
+    key: Array,
 ) -> tuple[TD3State, Metrics]:
     sample_key, noise_key, relabel_key = jax.random.split(key, 3)
     batch = replay.sample(state.ring, sample_key, batch_size=config.batch_size)
@@ -120,7 +129,7 @@ def _one_update(
     critic, critic_optimizer = _adam_step(
         state.params["critic"], critic_grad, state.critic_optimizer, config.critic_learning_rate, ready
     )
-    actor_grad, actor_metrics = jax.grad(partial(_actor_loss, config, penalty), has_aux=True)(
+    actor_grad, actor_metrics = jax.grad(partial(_actor_loss, config, penalty, imitation), has_aux=True)(
         state.params["actor"], critic, batch
     )
     actor, actor_optimizer = _adam_step(
@@ -152,11 +161,18 @@ def _critic_loss(config: TD3Config, params: Any, target: Any, batch: Transition,
 
 
 def _actor_loss(
-    config: TD3Config, penalty: Penalty | None, params: Any, critic: Any, batch: Transition
+    config: TD3Config,
+    penalty: Penalty | None,
+    imitation: Imitation | None,
+    params: Any,
+    critic: Any,
+    batch: Transition,
 ) -> tuple[Array, Metrics]:
     action = _policy(config, params, batch.obs, batch.action.shape[-1])
     price = penalty(batch, action) if penalty is not None else 0.0
     loss = _mean(price - _q(config, critic, batch.obs, action)[0], batch.weight)
+    if imitation is not None:
+        loss += imitation.loss(_policy(config, params, imitation.obs, batch.action.shape[-1]))
     return loss, {"actor_loss": loss}
 
 

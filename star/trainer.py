@@ -22,10 +22,11 @@ from envs.vector import VectorEnv
 from star import episode, evaluation, hierarchy, report
 from star import state as states
 from star.checkpoint import Checkpoints, check_compatible
-from star.config import Config, ConfigError
+from star.config import Config, ConfigError, TeacherConfig
 from star.episode import Episode
 from star.loading import parse
 from star.metrics import Display, Journal, mean
+from star.sgim.teachers import Demonstrations, shortest_paths
 from star.state import Spec, TrainState
 
 # Streams of random keys that no seed of training uses.
@@ -82,23 +83,24 @@ def build(config: Config) -> Program:
     except ValueError as error:
         raise ConfigError(str(error)) from None
     agent = config.agent()
+    lessons = tuple(_demonstrations(teacher, env) for teacher in config.sgim.teachers)
     trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
     tested = VectorEnv(make_env(config, "test"), config.trainer.eval_episodes, auto_reset=False)
 
-    def epoch(agent: Any, state: TrainState) -> Any:
-        return jax.vmap(partial(hierarchy.epoch, agent, spec, trained))(state)
+    def epoch(agent: Any, lessons: Any, state: TrainState) -> Any:
+        return jax.vmap(partial(hierarchy.epoch, agent, spec, trained, teachers=lessons))(state)
 
     def evaluate(agent: Any, state: TrainState, keys: jax.Array) -> Any:
         return jax.vmap(lambda one, key: episode.evaluate(agent, spec, tested, one, key=key))(state, keys)
 
-    jitted_epoch, jitted_evaluate = jax.jit(epoch, donate_argnums=1), jax.jit(evaluate)
+    jitted_epoch, jitted_evaluate = jax.jit(epoch, donate_argnums=2), jax.jit(evaluate)
     init = jax.jit(lambda agent, keys: jax.vmap(lambda key: states.init(agent, spec, key=key))(keys))
     return Program(
         config=config,
         spec=spec,
         walls=np.asarray(env.arena.walls()),
         init=lambda keys: init(agent, keys),
-        epoch=lambda state: jitted_epoch(agent, state),
+        epoch=lambda state: jitted_epoch(agent, lessons, state),
         evaluate=lambda state, keys: jitted_evaluate(agent, state, keys),
     )
 
@@ -297,6 +299,11 @@ def _resolve(config: Config, engine: str, spec: Spec) -> Config:
     if values["abstraction"]["cuts"] is None and values["abstraction"]["grid"] is None:
         values["abstraction"]["cuts"] = spec.region_cuts
     return parse(values)
+
+
+def _demonstrations(teacher: TeacherConfig, env: Any) -> Demonstrations:
+    """What a teacher shows."""
+    return shortest_paths(env)
 
 
 def make_env(config: Config, goals: str, **others: Any) -> Any:

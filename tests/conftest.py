@@ -135,7 +135,7 @@ def record(agent, spec, env, state, key):
             "tutor": hierarchy._tutor_transition(agent, spec, advanced, before.env.obs, action, steps),
             "controller": hierarchy._controller_rollout(agent, spec, steps),
         }
-        return episode.restart_ended(env, advanced, steps, key=reset_key), saved
+        return episode.restart_ended(spec, env, advanced, steps, key=reset_key), saved
 
     start_key, scan_key = jax.random.split(key)
     streams = episode.start(spec, env, practice=0.6, key=start_key)

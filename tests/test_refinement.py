@@ -7,6 +7,7 @@ import pytest
 
 from star import abstraction as regions
 from star import forward_model, loading, refinement, replay
+from star.abstraction import Cut
 from star.forward_model import Outcome
 from star.reachability import MISSES, REACHES, UNKNOWN, Leaves
 from star.refinement import Goals, Graph, Split
@@ -202,9 +203,15 @@ def test_the_best_cut_is_that_of_a_brute_force_gini_search(best_cut, seed):
     assert low[cut.dimension] + 2 <= cut.position <= high[cut.dimension] - 2
 
 
+def split_of(done):
+    """Region 1 was cut, or not, which made region 4."""
+    cut = Cut(region=jnp.int32(1), dimension=jnp.int32(0), position=jnp.float32(0))
+    return Split(done=jnp.array(done), cut=cut, child=jnp.int32(4))
+
+
 def test_after_a_split_starts_inherit_verdicts_and_targets_begin_anew():
     graph = random_graph(2)
-    after = refinement.on_split(graph, Split(done=jnp.array(True), parent=jnp.int32(1), child=jnp.int32(4)))
+    after = refinement.on_split(graph, split_of(True))
     for i in range(R):
         for j in range(R):
             changed = i in (1, 4) or j in (1, 4)
@@ -213,7 +220,7 @@ def test_after_a_split_starts_inherit_verdicts_and_targets_begin_anew():
             assert float(after.transitions[i, j]) == (0 if changed else float(graph.transitions[i, j]))
             assert float(after.error[i, j]) == float(graph.error[old])
             assert bool(after.stable[i, j]) == bool(graph.stable[old])
-    unchanged = refinement.on_split(graph, Split(done=jnp.array(False), parent=jnp.int32(1), child=jnp.int32(4)))
+    unchanged = refinement.on_split(graph, split_of(False))
     jax.tree.map(np.testing.assert_array_equal, graph, unchanged)
 
 

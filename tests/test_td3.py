@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import replay, td3
+from star import loading, replay, td3
 from star.replay import Transition
 
 

@@ -93,7 +93,7 @@ def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[floa
         goals=jnp.zeros((capacity, config.window, d)),
         competences=jnp.zeros((capacity, config.window)),
         written=jnp.zeros(capacity, jnp.int32),
-        mean=jnp.full(capacity, jnp.nan),
+        mean=jnp.full(capacity, jnp.nan, jnp.float32),
         shares=jnp.zeros(pairs),
         gains=jnp.zeros(pairs),
         episodes=jnp.zeros(pairs),
@@ -107,6 +107,12 @@ def progress(config: SelectionConfig, state: SgimState) -> Float[Array, "R"]:
     newer, older = _halves(state)
     grown = _mean(state.competences, newer) - _mean(state.competences, older)
     return jnp.where(state.abstraction.active & newer.any(axis=-1), grown, 0.0)
+
+
+def competence(state: SgimState) -> Float[Array, "R"]:
+    """Mean of what is remembered of each region; 0 where that is nothing."""
+    newer, older = _halves(state)
+    return _mean(state.competences, newer | older)
 
 
 def interest(config: SelectionConfig, state: SgimState) -> Float[Array, "R S"]:

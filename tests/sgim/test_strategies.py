@@ -1,0 +1,371 @@
+"""What SGIM makes of an epoch: its lessons against loops, its teachers' budgets, and the trainer that follows them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+import star.state
+from star import abstraction as regions
+from star import commander, hierarchy, loading, ppo, td3
+from star.config import SgimConfig
+from star.loading import ConfigError
+from star.replay import Imitation, Transition
+from star.sgim import selection, strategies
+from star.sgim.teachers import Demonstrations, nearest
+from star.state import Spec
+
+B, L = 64, 3
+GUIDE = {"name": "guide", "kind": "decomposition"}
+AIMS = {"name": "aims", "kind": "outcome", "source": "demos.npz"}
+ACTS = {"name": "acts", "kind": "action", "source": "demos.npz"}
+
+
+assign = jax.jit(strategies.assign)
+learn = jax.jit(strategies.learn)
+
+
+def four_regions():
+    return regions.create(((0.0, 0.0), (4.0, 4.0)), ((2.0,), (2.0,)), max_regions=6)
+
+
+def demonstrations(seed=0, n=5, length=L):
+    rng = np.random.default_rng(seed)
+    points = lambda *shape: jnp.asarray(rng.uniform(0, 4, (*shape, 2)), jnp.float32)  # noqa: E731
+    lengths = jnp.asarray(rng.integers(1, 7, n))
+    return Demonstrations(
+        starts=points(n),
+        outcomes=points(n),
+        waypoints=points(n, length),
+        states=jnp.asarray(rng.normal(size=(n, 8, 4)), jnp.float32),
+        actions=jnp.asarray(rng.normal(size=(n, 8, 2)), jnp.float32),
+        lengths=lengths,
+    )
+
+
+def settings(**values):
+    return SgimConfig.model_validate(values)
+
+
+def lesson_of(config, state=None, *, taught=None, seed=0, teachers=None):
+    """An assigned lesson, what it was assigned for, and the state."""
+    rng = np.random.default_rng(seed)
+    start, goal = (jnp.asarray(rng.uniform(0, 4, (B, 2)), jnp.float32) for _ in range(2))
+    state = strategies.init(config, four_regions()) if state is None else state
+    taught = jnp.ones(B, bool) if taught is None else taught
+    teachers = [demonstrations(i, length=i + 1) for i in range(len(config.teachers))] if teachers is None else teachers
+    key = jax.random.key(seed)
+    return (
+        strategies.assign(config, state, teachers, start=start, goal=goal, taught=taught, key=key),
+        start,
+        goal,
+        state,
+    )
+
+
+def located(point):
+    table = four_regions()
+    return next(
+        j for j in range(4) if (table.lower[j] <= point).all() and ((point < table.upper[j]) | (point >= 4)).all()
+    )
+
+
+def test_nothing_is_kept_where_everything_is_left_as_ever():
+    assert strategies.init(settings(), four_regions()) is None
+    for values in ({"goals": True}, {"exploration": True}, {"refinement": True}, {"teachers": [GUIDE]}):
+        assert strategies.init(settings(**values), four_regions()) is not None
+
+
+def test_goals_stay_those_of_the_task_unless_they_may_be_chosen():
+    lesson, _, goal, _ = lesson_of(settings(exploration=True))
+    np.testing.assert_array_equal(lesson.choice.goal, goal)
+    assert lesson.choice.region.tolist() == [located(np.asarray(g)) for g in goal]
+    chosen, _, goal, _ = lesson_of(settings(goals=True))
+    assert not np.isclose(chosen.choice.goal, goal).all(axis=1).any()
+    assert chosen.choice.region.tolist() == [located(np.asarray(g)) for g in chosen.choice.goal]
+    assert set(chosen.choice.region.tolist()) == {0, 1, 2, 3}
+
+
+def test_each_teacher_shows_what_is_nearest_and_only_to_those_who_ask():
+    config = settings(teachers=[GUIDE, AIMS, ACTS])
+    lesson, start, goal, _ = lesson_of(config)
+    demos = [demonstrations(i, length=i + 1) for i in range(3)]
+    asked = np.asarray(lesson.choice.strategy)
+    assert set(asked) == {0, 1, 2, 3}
+    for b in range(B):
+        guide, aims, acts = (
+            int(nearest(shown, None if i == 1 else start[b], goal[b])) for i, shown in enumerate(demos)
+        )
+        expected = {2: demos[1].outcomes[aims], 3: demos[2].outcomes[acts]}.get(asked[b], goal[b])
+        np.testing.assert_array_equal(lesson.choice.goal[b], expected)
+        assert int(lesson.leg[b]) == (0 if asked[b] == 1 else L)
+        if asked[b] == 1:
+            np.testing.assert_array_equal(lesson.waypoints[b], np.repeat(demos[0].waypoints[guide], L, axis=0))
+    np.testing.assert_array_equal(strategies.guided(config, lesson), asked == 1)
+
+
+def test_own_decomposition_goes_by_way_of_the_centre_of_a_region():
+    config = settings(strategies=["autonomous", "decomposition"])
+    lesson, _, goal, state = lesson_of(config)
+    mine = np.asarray(lesson.choice.strategy) == 1
+    assert mine.any() and not mine.all()
+    centres = np.asarray((state.abstraction.lower + state.abstraction.upper) / 2)[:4]
+    first = np.asarray(lesson.waypoints[:, 0])
+    assert all(any((point == centre).all() for centre in centres) for point in first[mine])
+    assert len(np.unique(first[mine], axis=0)) == 4
+    np.testing.assert_array_equal(np.asarray(lesson.leg) == 0, mine)
+    assert not strategies.guided(config, lesson).any()
+
+
+def test_no_teacher_is_asked_more_often_than_his_budget_and_none_who_is_away():
+    config = settings(teachers=[{**GUIDE, "max_queries": 5}, {**AIMS, "availability": 0}])
+    taught = jnp.arange(B) % 4 > 0
+    state, asked = None, 0
+    for seed in range(3):
+        lesson, _, _, state = lesson_of(config, state, taught=taught, seed=seed)
+        mine = np.asarray(lesson.choice.strategy)[np.asarray(taught)]
+        asked += (mine == 1).sum()
+        assert asked == 5 and not (mine == 2).any()
+        lesson = strategies.grade(lesson, jnp.ones(B, bool), jnp.ones(B), radius=0.5)
+        state, metrics = learn(config, state, lesson)
+        assert int(metrics["queries_guide"]) == 5
+
+
+def test_asking_evenly_pays_no_heed_to_progress():
+    config = settings(ask="evenly", teachers=[{**GUIDE, "cost": 100}, AIMS])
+    state = strategies.init(config, four_regions())
+    state = state.replace(gains=state.gains.at[:, 2].set(1.0))
+    counts = sum(
+        np.bincount(np.asarray(lesson_of(config, state, seed=seed)[0].choice.strategy), minlength=3)
+        for seed in range(5)
+    )
+    assert stats.chisquare(counts).pvalue > 1e-3
+
+
+def test_waypoints_are_passed_in_the_region_they_lie_in():
+    table = four_regions()
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 4, (B, L, 2)).astype(np.float32)
+    leg, region = rng.integers(0, L + 1, B), rng.integers(0, 4, B)
+    lesson = lesson_of(settings(teachers=[GUIDE]))[0].replace(waypoints=jnp.asarray(points), leg=jnp.asarray(leg))
+    after, target = jax.jit(strategies.impose)(lesson, table, jnp.asarray(region))
+    passed = 0
+    for b in range(B):
+        expected = leg[b]
+        for i in range(leg[b], L):
+            if located(points[b, i]) == region[b]:
+                expected = i + 1
+        assert int(after.leg[b]) == expected
+        assert int(target[b]) == (located(points[b, expected]) if expected < L else -1)
+        passed += expected > leg[b]
+    assert passed > 5
+
+
+def test_competence_is_how_much_nearer_the_first_episode_came():
+    lesson = strategies.begin(lesson_of(settings(goals=True))[0], jnp.full(B, 10.0), radius=2.0)
+    lesson = strategies.grade(lesson, jnp.arange(B) == 0, jnp.full(B, 6.0), radius=2.0)  # from 8 m to 4 m
+    assert float(lesson.competence[0]) == pytest.approx(0.5) and np.isnan(lesson.competence[1:]).all()
+    lesson = strategies.grade(lesson, jnp.ones(B, bool), jnp.full(B, 1.0), radius=2.0)
+    assert float(lesson.competence[0]) == pytest.approx(0.5) and (lesson.competence[1:] == 1).all()
+    away = lesson.replace(competence=jnp.full(B, jnp.nan))
+    worse = strategies.grade(away, jnp.ones(B, bool), jnp.full(B, 30.0), radius=2.0)
+    assert (worse.competence == 0).all()
+
+
+def test_only_what_is_taught_is_learnt_from():
+    config = settings(goals=True, strategies=["autonomous", "babbling"])
+    taught = jnp.arange(B) < 10
+    lesson, _, _, state = lesson_of(config, taught=taught)
+    lesson = lesson.replace(competence=jnp.where(taught, 0.5, 1.0))
+    after, metrics = learn(config, state, lesson)
+    assert float(after.episodes.sum()) == 10
+    assert float(metrics["competence"]) == pytest.approx(0.5)
+    asked = np.asarray(lesson.choice.strategy)[:10]
+    assert float(metrics["share_babbling"]) == pytest.approx((asked == 1).mean())
+    assert float(metrics["share_autonomous"] + metrics["share_babbling"]) == pytest.approx(1)
+    np.testing.assert_array_equal(
+        strategies.babbles(config, lesson), np.asarray(taught) & (np.asarray(lesson.choice.strategy) == 1)
+    )
+
+
+def test_edges_to_what_is_half_mastered_and_stands_still_are_the_most_urgent():
+    config = settings(refinement=True)
+    state = strategies.init(config, four_regions())
+    window = state.competences.shape[1]
+    levels = jnp.array([0.0, 1.0, 0.5, 0.5, 0, 0])
+    competences = (
+        jnp.repeat(levels[:, None], window, axis=1).at[3, : window // 2].set(0.2).at[3, window // 2 :].set(0.8)
+    )
+    state = state.replace(competences=competences, written=jnp.full(6, window))
+    weight = np.asarray(strategies.urgency(config, state))
+    assert weight[2] == pytest.approx(1) and weight[0] == weight[1] == pytest.approx(0.1)
+    assert weight[0] < weight[3] < weight[2]
+    assert strategies.urgency(settings(goals=True), state) == 1.0
+
+
+def test_random_targets_follow_their_attraction():
+    size, n = 5, 4000
+    state = commander.init(loading.parse({}).commander, regions=size)
+    allowed = jnp.ones((size, size), bool).at[:, 1].set(False)
+    attraction = jnp.array([0.1, 0.4, 0.2, 0.3, 0.0])
+    zeros = jnp.zeros(n, jnp.int32)
+    targets = commander.act(
+        state,
+        commander.Successors(allowed, allowed),
+        zeros,
+        zeros,
+        attraction=attraction,
+        epsilon=1.0,
+        key=jax.random.key(0),
+    )
+    counts = np.bincount(targets, minlength=size)
+    assert counts[1] == counts[4] == 0
+    assert stats.chisquare(counts[[0, 2, 3]], n * np.array([1, 2, 3]) / 6).pvalue > 1e-3
+
+
+def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
+    config = loading.parse({"commander": {"learner": "q", "learning_rate": 0.5, "reward": "mean"}}).commander
+    state = commander.init(config, regions=3)
+    state = state.replace(q=state.q.at[0, 1].set(jnp.array([0.0, 1.0, 0.4])))
+    allowed = commander.Successors(jnp.ones((3, 3), bool), jnp.ones((3, 3), bool))
+    one = lambda value: jnp.full(1, value)  # noqa: E731
+    decision = commander.Decision(
+        region=one(0),
+        goal_region=one(1),
+        target=one(2),
+        reward=one(0.0),
+        next_region=one(2),
+        weight=one(1.0),
+        lost=one(0.0),
+        practised=one(0.0),
+        shown=one(1.0),
+    )
+    alone = commander.observe(config, state, allowed, decision.replace(shown=None)).q[0, 1, 2]
+    taught = commander.observe(config, state, allowed, decision, margin=0.2).q[0, 1, 2]
+    assert float(taught) == pytest.approx(float(alone) + 0.5 * (1.0 + 0.2 - float(alone)))
+    ignored = commander.observe(config, state, allowed, decision.replace(shown=one(0.0)), margin=0.2).q[0, 1, 2]
+    assert float(ignored) == pytest.approx(float(alone))
+
+
+@pytest.mark.parametrize("learner", [ppo, td3])
+def test_the_actor_comes_near_to_demonstrated_actions(learner):
+    name = learner.__name__.rsplit(".", 1)[-1]
+    small = {"hidden": [16], "batch_size": 8, "buffer_size": 64, "policy_delay": 1, "actor_learning_rate": 1e-2}
+    values = {"hidden": [16], "passes": 1, "minibatches": 1, "learning_rate": 1e-3} if learner is ppo else small
+    config = getattr(loading.parse({"controller": {"learner": name, name: values}}).controller, name)
+    rng = np.random.default_rng(0)
+    noise = lambda *shape: jnp.asarray(rng.normal(size=(4, 8, *shape)), jnp.float32)  # noqa: E731
+    nothing, whole = jnp.zeros((4, 8)), jnp.ones((4, 8))
+    rollout = Transition(
+        obs=noise(3),
+        action=noise(2),
+        reward=nothing,
+        next_obs=noise(3),
+        terminated=nothing,
+        cut=whole,
+        weight=whole,
+    )
+    example = jax.tree.map(lambda x: x[0, 0], rollout)
+    shown = Imitation(
+        obs=jnp.asarray(rng.normal(size=(16, 3)), jnp.float32), action=jnp.full((16, 2), 0.5), weight=jnp.ones(16)
+    )
+
+    @jax.jit
+    def far(weight):
+        def once(state, key):
+            imitation = shown.replace(weight=weight * shown.weight)
+            return learner.update(config, state, rollout, imitation=imitation, key=key)[0], None
+
+        state = learner.init(jax.random.key(0), config, example=example)
+        state, _ = jax.lax.scan(once, state, jax.random.split(jax.random.key(1), 60))
+        done = learner.act(config, state, shown.obs, deterministic=True, key=jax.random.key(0))
+        return jnp.abs(done - shown.action).mean()
+
+    assert far(10.0) < 0.5 * far(0.0)
+
+
+def test_steps_of_demonstrations_lead_to_the_end_of_their_segment():
+    demos = demonstrations()
+    drawn = strategies.shown(demos, 3, size=200, key=jax.random.key(0))
+    states, lengths = np.asarray(demos.states), np.asarray(demos.lengths)
+    seen = set()
+    for state, later, action, outcome in zip(
+        *map(np.asarray, (drawn.state, drawn.later, drawn.action, drawn.outcome)), strict=True
+    ):
+        n, t = (int(i[0]) for i in np.nonzero((states == state).all(axis=-1)))
+        assert t < lengths[n]
+        np.testing.assert_array_equal(later, states[n, min(t // 3 * 3 + 3, lengths[n])])
+        np.testing.assert_array_equal(action, demos.actions[n, t])
+        np.testing.assert_array_equal(outcome, demos.outcomes[n])
+        seen.add((n, t))
+    assert seen == {(n, t) for n in range(5) for t in range(lengths[n])}
+
+
+@pytest.mark.parametrize(
+    ("values", "told"),
+    [
+        ({"sgim": {"teachers": [{**AIMS, "source": "map"}]}}, "aims"),
+        ({"sgim": {"teachers": [GUIDE, GUIDE]}}, "guide"),
+        ({"sgim": {"strategies": []}}, "sgim.strategies"),
+        ({"sgim": {"teachers": [{**GUIDE, "costs": 3}]}}, "did you mean sgim.teachers.0.cost?"),
+        ({"sgim": {"teachers": [{**GUIDE, "cost": 0}]}}, "sgim.teachers.0.cost: 0 is not allowed"),
+        ({"sgim": {"strategies": ["babbling"]}, "tutor": {"enabled": False}}, "babbling needs tutor.enabled"),
+        ({"sgim": {"teachers": [GUIDE]}, "commander": {"enabled": False}}, "decomposition needs commander.enabled"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_line(values, told):
+    with pytest.raises(ConfigError) as error:
+        loading.parse(values)
+    assert told in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.fixture(scope="module")
+def schooled(tiny, breaking_env):
+    """Twelve epochs of the tiny hierarchy with all that SGIM can do, states and metrics, and how often it compiled."""
+    everything = {
+        "sgim": {
+            "goals": True,
+            "strategies": ["autonomous", "babbling", "decomposition"],
+            "teachers": [GUIDE, ACTS],
+            "exploration": True,
+            "refinement": True,
+        }
+    }
+    parsed = loading.parse({**tiny, **everything})
+    spec = Spec.of(breaking_env.env)
+    teachers = [demonstrations(length=2), demonstrations(1, length=1)]
+    traces = []
+
+    @jax.jit
+    def epoch(state):
+        traces.append(0)
+        return hierarchy.epoch(parsed.agent(), spec, breaking_env, state, teachers)
+
+    state = jax.jit(lambda key: star.state.init(parsed.agent(), spec, key=key))(jax.random.key(0))
+    states, metrics = [state], []
+    for _ in range(12):
+        state, more = epoch(state)
+        states.append(state)
+        metrics.append(more)
+    return parsed, states, metrics, len(traces)
+
+
+def test_sgim_follows_the_agent_through_its_epochs(schooled):
+    parsed, states, metrics, traces = schooled
+    assert traces == 1
+    assert int(states[-1].abstraction.count) > int(states[0].abstraction.count)
+    for state in states:
+        jax.tree.map(np.testing.assert_array_equal, state.sgim.abstraction, state.abstraction)
+    for more in metrics:
+        shares = [float(more[f"sgim/share_{name}"]) for name in parsed.sgim.names]
+        assert sum(shares) == pytest.approx(1)
+        assert 0 <= float(more["sgim/competence"]) <= 1 and int(more["sgim/refused"]) == 0
+    assert float(states[-1].sgim.episodes.sum()) > 0
+    remembered = selection.competence(states[-1].sgim)
+    assert np.isfinite(remembered).all() and (remembered > 0).any()
+
+
+def test_everything_that_learns_stays_finite(schooled):
+    for name, value in schooled[2][-1].items():
+        assert np.isfinite(value), name
