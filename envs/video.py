@@ -13,7 +13,6 @@ import importlib.util
 import io
 import itertools
 import json
-import os
 import shutil
 import subprocess
 import tempfile
@@ -24,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from envs import files
 from envs.options import EnvError
 
 STILLS = (".png", ".jpg")
@@ -33,18 +33,8 @@ QUALITY = {".jpg": 90, ".html": 75}  # of JPEG and WebP, up to 100
 
 def check(path: Path, *, force: bool = False) -> None:
     """Raise `EnvError` in one line if `write` could not write `path`, or would replace it without `force`."""
-    suffix = path.suffix.lower()
-    if path.is_dir():
-        raise EnvError(f"{path}: is a folder")
-    if suffix not in STILLS + FILMS:
-        raise EnvError(f"{path}: cannot tell what to write; allowed endings: {', '.join(STILLS + FILMS)}")
-    if not path.parent.is_dir():
-        raise EnvError(f"{path}: there is no folder {path.parent}")
-    if not os.access(path.parent, os.W_OK):
-        raise EnvError(f"{path}: cannot be written: the folder {path.parent} is not writable")
-    if path.exists() and not force:
-        raise EnvError(f"{path}: exists; replace it with --force")
-    if suffix == ".mp4":
+    files.check(path, STILLS + FILMS, force=force)
+    if path.suffix.lower() == ".mp4":
         _ffmpeg()
 
 
@@ -62,13 +52,8 @@ def write(path: Path, pictures: Iterable[np.ndarray], *, fps: float = 20.0) -> i
       EnvError: in one line, if the file cannot be written.
     """
     counted = _Counted(pictures)
-    try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:
-            partial = Path(folder) / path.name
-            _WRITERS[path.suffix.lower()](partial, counted, fps)
-            os.replace(partial, path)
-    except OSError as error:
-        raise EnvError(f"{path}: cannot be written: {error.strerror or error}") from None
+    with files.whole(path) as partial:
+        _WRITERS[path.suffix.lower()](partial, counted, fps)
     return counted.count
 
 

@@ -26,6 +26,7 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star evaluate runs/NAME                       success on test goals, with 95 % intervals
   star render point_maze --out maze.png         a picture of a task
   star render --run runs/NAME --out film.html   an episode of a trained agent
+  star record runs/NAME --out demos.npz         what a trained agent can show another
   star envs                                     the tasks
   star settings [PREFIX]                        every setting, its default and its meaning
 """
@@ -34,6 +35,9 @@ _RENDER = """\
 Random actions in TASK, or with --run the greedy policy of a trained agent on test goals.
 .png and .jpg hold one picture, the end of the episode; .mp4, .gif and .html the whole of it.
 A setting of the task is given as --env.options.KEY VALUE."""
+_RECORD = """\
+Greedy episodes of a trained agent on training goals. Those that reach the goal are written, up to the step that
+does, as demonstrations for other agents: routes, states and actions."""
 _OVERRIDES = "Any setting can be overridden: --section.key VALUE (see `star settings`)."
 
 
@@ -93,6 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.set_defaults(function=_evaluate)
 
     _add_render(commands.add_parser("render", help="pictures of a task or of an agent", description=_RENDER, **shape))
+    _add_record(commands.add_parser("record", help="demonstrations by a trained agent", description=_RECORD, **shape))
     listing = commands.add_parser("envs", help="list the tasks", **shape)
     listing.set_defaults(function=_envs)
     settings = commands.add_parser("settings", help="list every setting with its default and meaning", **shape)
@@ -123,6 +128,18 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     render.add_argument("--force", action="store_true", help="replace an existing file")
     render.add_argument("--quiet", action="store_true", help="no progress")
     render.set_defaults(function=_render)
+
+
+def _add_record(record: argparse.ArgumentParser) -> None:
+    record.add_argument("run", type=Path, help="run directory")
+    record.add_argument("--out", type=Path, required=True, metavar="FILE", help=".npz")
+    record.add_argument("--episodes", type=_count(10_000), default=100, metavar="N", help="to play (default: 100)")
+    record.add_argument("--checkpoint", default="last", metavar="last|best|STEPS", help="which one (default: last)")
+    record.add_argument("--seed", type=_natural, metavar="N", help="which agent of the run (default: its first seed)")
+    record.add_argument("--evaluation-seed", type=_natural, default=0, metavar="N", help="seed of goals and starts")
+    record.add_argument("--force", action="store_true", help="replace an existing file")
+    record.add_argument("--quiet", action="store_true", help="no progress")
+    record.set_defaults(function=_record)
 
 
 def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
@@ -273,6 +290,27 @@ def _check_output(options: argparse.Namespace) -> None:
         opengl.backend()
     except EnvError as error:
         raise ConfigError(str(error)) from None
+
+
+def _record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    config = _run_config(options.run, {"env.engine": "auto"} | overrides)
+
+    from star import record
+
+    print(
+        record.record(
+            config,
+            options.run,
+            options.out,
+            episodes=options.episodes,
+            checkpoint=options.checkpoint,
+            agent=options.seed,
+            seed=options.evaluation_seed,
+            force=options.force,
+            quiet=options.quiet,
+        )
+    )
+    return 0
 
 
 def _envs(options: argparse.Namespace, overrides: dict[str, Any]) -> int:

@@ -64,8 +64,8 @@ class Episode(struct.PyTreeNode):
         return cls(*(jnp.zeros(num_envs) for _ in range(4)))
 
 
-Record = Callable[[EnvState, Array, Box], Any]
-"""What to keep of an env step, given the B environments before it, their subgoals [B, d] and their target boxes."""
+Record = Callable[[EnvState, Array, Box, Array], Any]
+"""What to keep of an env step, given the B environments before it, subgoals [B, m], target boxes, actions [B, act]."""
 
 
 class Steps(struct.PyTreeNode):
@@ -253,9 +253,9 @@ def rollout(
     def step(carry: tuple[EnvState, Array, Array, Episode], step_key: Array) -> tuple[tuple, Steps]:
         env_state, subgoal, alive, episode = carry
         obs = env_state.obs
-        recorded = record(env_state, subgoal, streams.box) if record else None
         seen = controller.observe(spec.state(obs), subgoal, position=spec.abstract_indices)
         action = learner.act(config.controller, state.controller, seen, deterministic=deterministic, key=step_key)
+        recorded = record(env_state, subgoal, streams.box, action) if record else None
         env_state = env.step(env_state, action)
         after = controller.next_subgoal(subgoal, spec.pose(obs), spec.pose(env_state.obs))
         steps = Steps(

@@ -44,7 +44,7 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         values = read_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file{_nearest_file(path)}") from None
+        raise ConfigError(f"{path}: no such file{nearest_file(path, ('.yaml', '.yml'))}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
     except yaml.YAMLError as error:
@@ -141,10 +141,11 @@ def _nearest_key(path: Sequence[str]) -> str:
     return f" (allowed: {', '.join(section.model_fields)})"
 
 
-def _nearest_file(path: Path) -> str:
+def nearest_file(path: Path, endings: Sequence[str]) -> str:
+    """` (did you mean ...?)` with the file beside `path` whose name is most like it, of those with these endings."""
     if not path.parent.is_dir():
         return ""
-    names = [entry.name for entry in path.parent.iterdir() if entry.suffix in (".yaml", ".yml")]
+    names = [entry.name for entry in path.parent.iterdir() if entry.suffix in endings]
     matches = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
     return f" (did you mean {path.parent / matches[0]}?)" if matches else ""
 

@@ -135,19 +135,12 @@ def record_run(
     config: Config, run_dir: Path, *, checkpoint: str, agent: int | None, envs: int, steps: int | None, seed: int
 ) -> Recording:
     """A greedy episode of the agent with seed `agent` in a checkpoint of `run_dir`, on test goals."""
-    program = trainer.build(config)
-    seeds = program.seeds
-    if agent is not None and agent not in seeds:
-        raise ConfigError(f"--seed: {agent} is not among those of {run_dir}: {', '.join(map(str, seeds))}")
-    number = 0 if agent is None else seeds.index(agent)
+    program, state, key = trainer.load_agent(config, run_dir, checkpoint=checkpoint, agent=agent, seed=seed)
     length = _length(program.spec.episode_length, steps)
-    _, states = trainer.load_checkpoint(program, run_dir, checkpoint)
-    state = jax.tree.map(lambda leaf: leaf[number], states)
-    key = trainer.evaluation_keys(program, seed, stream=trainer.AFTERWARDS)[number]
     env = trainer.make_env(program.config, "test")
     vector, spec = VectorEnv(env, envs, auto_reset=False), program.spec
 
-    def record(env_state: Any, subgoal: jax.Array, box: Box) -> Moments:
+    def record(env_state: Any, subgoal: jax.Array, box: Box, action: jax.Array) -> Moments:
         aim = box.centre if state.tutor is None else spec.abstract(env_state.obs) + subgoal[..., : box.lower.shape[-1]]
         return _look(env, env_state).replace(subgoal=aim, lower=box.lower, upper=box.upper)
 

@@ -149,6 +149,23 @@ def load_checkpoint(program: Program, run_dir: Path, wanted: str) -> tuple[int, 
         checkpoints.close()
 
 
+def load_agent(
+    config: Config, run_dir: Path, *, checkpoint: str, agent: int | None, seed: int
+) -> tuple[Program, TrainState, jax.Array]:
+    """The agent of seed `agent` (None: the first) in a checkpoint of `run_dir`, and the key of its episodes.
+
+    `seed` is the one that a user chose for the evaluation.
+    """
+    program = build(config)
+    seeds = program.seeds
+    if agent is not None and agent not in seeds:
+        raise ConfigError(f"--seed: {agent} is not among those of {run_dir}: {', '.join(map(str, seeds))}")
+    number = 0 if agent is None else seeds.index(agent)
+    _, states = load_checkpoint(program, run_dir, checkpoint)
+    key = evaluation_keys(program, seed, stream=AFTERWARDS)[number]
+    return program, jax.tree.map(lambda leaf: leaf[number], states), key
+
+
 def evaluation_keys(program: Program, number: int, *, stream: int = _DURING_TRAINING) -> jax.Array:
     """Keys of one evaluation, one per seed, apart from all keys of training.
 

@@ -19,7 +19,8 @@ import star.state  # noqa: E402
 from envs import opengl  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
-from star import episode, hierarchy, loading  # noqa: E402
+from star import episode, hierarchy, loading, trainer  # noqa: E402
+from star.checkpoint import Checkpoints  # noqa: E402
 
 settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
 settings.load_profile("star")
@@ -36,6 +37,17 @@ TINY = {
     "forward_model": {"hidden": [8], "batch_size": 8, "buffer_size": 64, "updates_per_epoch": 2},
     "refinement": {"depth": 2, "pairs_per_epoch": 1, "min_transitions": 1, "min_visits": 1},
     "trainer": {"num_envs": NUM_ENVS},
+}
+
+# Of agents that have learnt nothing.
+UNTRAINED = {
+    "env": {"name": "point_maze", "engine": "jax", "options": {"episode_length": 40}},
+    "commander": {"period": 20},
+    "tutor": {"unroll": 2, "ppo": {"hidden": [8], "minibatches": 1}},
+    "controller": {"ppo": {"hidden": [8], "minibatches": 1}},
+    "abstraction": {"max_regions": 8},
+    "forward_model": {"hidden": [8], "buffer_size": 64, "batch_size": 8},
+    "trainer": {"num_envs": 4, "eval_episodes": 3, "num_seeds": 2, "seed": 5},
 }
 
 
@@ -78,6 +90,22 @@ def can_draw():
         opengl.backend()
     except envs.EnvError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory):
+    """A run directory with one checkpoint of agents that have learnt nothing but move, of the seeds 5 and 6."""
+    run_dir = tmp_path_factory.mktemp("runs") / "new"
+    run_dir.mkdir()
+    program = trainer.build(loading.parse(UNTRAINED))
+    state = program.init(trainer.seed_keys(program))
+    strong = jax.tree.map(lambda x: 30 * x, state.controller.params)
+    state = state.replace(controller=state.controller.replace(params=strong))
+    (run_dir / "config.yaml").write_text(program.config.to_yaml())
+    checkpoints = Checkpoints(run_dir)
+    checkpoints.save(160, state, program.config, success=0.0)
+    checkpoints.close()
+    return run_dir
 
 
 @pytest.fixture(scope="session")

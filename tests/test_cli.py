@@ -23,6 +23,7 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "point.yaml").write_text("env: {name: point_maze}\ntrainer: {num_envs: 8}\n")
     (tmp_path / "ant.yaml").write_text("env: {name: ant_maze}\ntrainer: {num_envs: 8}\n")
     (tmp_path / "old.png").write_text("precious")
+    (tmp_path / "old.npz").write_text("precious")
     (tmp_path / "broken.yaml").write_text("tutor:\n  period: [5\ntrainer: {}\n")
     run = tmp_path / "runs" / "old"
     run.mkdir(parents=True)
@@ -116,6 +117,14 @@ def refusal(capsys, folder, arguments):
         pytest.param("render point_maze --out a.gif --every 0", "from 1 to", id="render every 0th"),
         pytest.param("render point_maze --out a.gif --camera folow", "choose from", id="render unknown camera"),
         pytest.param("render --run runs/new --out a.gif", "runs/new: is not a run directory", id="render a non-run"),
+        pytest.param("record runs/old", "required: --out", id="record into nothing"),
+        pytest.param("record --out a.npz", "required: run", id="record nothing"),
+        pytest.param("record runs/new --out a.npz", "runs/new: is not a run directory", id="record a non-run"),
+        pytest.param("record runs/old --out a.npz", "runs/old: holds no checkpoint", id="record without checkpoint"),
+        pytest.param("record runs/old --out a.csv", "a.csv: cannot tell what to write", id="record an odd ending"),
+        pytest.param("record runs/old --out a/b.npz", "there is no folder a", id="record into no folder"),
+        pytest.param("record runs/old --out old.npz", "old.npz: exists; replace it with --force", id="record over"),
+        pytest.param("record runs/old --out a.npz --episodes 0", "from 1 to 10000", id="record no episode"),
         pytest.param("settings tutr", "tutr: no setting begins so", id="unknown prefix"),
         pytest.param("settings --tutor.period=5", "takes no settings", id="settings with a setting"),
         pytest.param("envs --tutor.period 5", "takes no settings", id="envs with a setting"),
@@ -259,7 +268,15 @@ def test_help_shows_how_to_train_resume_and_evaluate(capsys, arguments):
         code = end.code
     out, err = capsys.readouterr()
     assert (code, err) == (0, "")
-    for text in ("star train configs/", "--resume", "star evaluate", "star render", "star envs", "star settings"):
+    for text in (
+        "star train configs/",
+        "--resume",
+        "star evaluate",
+        "star render",
+        "star record",
+        "star envs",
+        "star settings",
+    ):
         assert text in out
 
 

@@ -8,7 +8,7 @@ import jax
 import pytest
 
 from envs.tasks import TASKS
-from star import cli, rendering, trainer
+from star import cli, record, rendering, trainer
 from star.cli import main
 from star.config import Config
 from star.loading import fields, parse
@@ -61,6 +61,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "evaluate", lambda config, run_dir, **_: report)
     monkeypatch.setattr(cli, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg
     monkeypatch.setattr(rendering, "render", lambda config, show, **_: "")
+    monkeypatch.setattr(record, "record", lambda config, run_dir, out, **_: "")
     return tmp_path
 
 
@@ -75,7 +76,7 @@ def test_every_command_line_of_the_pages_is_accepted(words, folder):
 def test_the_pages_show_how_to_train_resume_evaluate_and_look_things_up():
     shown = {tuple(one.values[0][1:3]) for one in STAR}
     assert ("train", "configs/point_maze.yaml") in shown and ("train", "--resume") in shown
-    assert {"train", "evaluate", "render", "settings", "envs"} == {words[0] for words in shown}
+    assert {"train", "evaluate", "render", "record", "settings", "envs"} == {words[0] for words in shown}
 
 
 @pytest.mark.parametrize("words", MAKE)
@@ -173,8 +174,15 @@ def test_the_example_of_the_metrics_page_runs(folder):
 
 
 def test_the_example_of_the_sgim_page_learns_all_three_exercises_and_asks_the_teacher():
-    (example,) = blocks("docs/sgim.md", "python")
+    example, *_ = blocks("docs/sgim.md", "python")
     names: dict = {}
     exec(example, names)
     assert (names["skill"] > 0.7).all()
     assert names["state"].episodes.sum() == 1000 and names["state"].episodes.sum(axis=0)[1] > 300
+
+
+def test_the_teacher_of_the_sgim_page_shows_the_way_over_the_gap():
+    *_, example = blocks("docs/sgim.md", "python")
+    names: dict = {}
+    exec(example, names)
+    assert names["route"].tolist() == [[8, 0, 4.5], [8, 24, 4.5], [0, 24, 4.5], [0, 24, 4.5]]

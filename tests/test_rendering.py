@@ -15,41 +15,18 @@ from PIL import Image
 import envs
 from envs import EnvError, opengl
 from star import cli, rendering, trainer
-from star.checkpoint import Checkpoints
 from star.config import ConfigError
-from star.loading import parse
+from star.loading import load, parse
 from star.rendering import Moments, Show
 
 ROOT = Path(__file__).parents[1]
 EPISODE = 40
-TINY = {
-    "env": {"name": "point_maze", "engine": "jax", "options": {"episode_length": EPISODE}},
-    "commander": {"period": 20},
-    "tutor": {"unroll": 2, "ppo": {"hidden": [8], "minibatches": 1}},
-    "controller": {"ppo": {"hidden": [8], "minibatches": 1}},
-    "abstraction": {"max_regions": 8},
-    "forward_model": {"hidden": [8], "buffer_size": 64, "batch_size": 8},
-    "trainer": {"num_envs": 4, "eval_episodes": 3, "num_seeds": 2, "seed": 5},
-}
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A run directory with one checkpoint of agents that have learnt nothing, of the seeds 5 and 6."""
-    run_dir = tmp_path_factory.mktemp("runs") / "new"
-    run_dir.mkdir()
-    program = trainer.build(parse(TINY))
-    (run_dir / "config.yaml").write_text(program.config.to_yaml())
-    checkpoints = Checkpoints(run_dir)
-    checkpoints.save(160, program.init(trainer.seed_keys(program)), program.config, success=0.0)
-    checkpoints.close()
-    return run_dir
 
 
 @pytest.fixture(scope="module")
 def recorded(run):
     """Three environments of the second agent, and what `trainer.evaluate` says of the same episodes."""
-    config = parse(TINY)
+    config = load(run / "config.yaml")
     recording = rendering.record_run(config, run, checkpoint="last", agent=6, envs=3, steps=None, seed=1)
     _, row = trainer.evaluate(config, run, seed=1)["seeds"]
     return SimpleNamespace(recording=recording, row=row)
