@@ -33,7 +33,8 @@ from star.commander import Decision, Successors
 from star.config import AgentConfig
 from star.loading import load
 from star.reachability import MISSES, REACHES
-from star.state import Spec, TrainState
+from star.spec import Spec
+from star.state import TrainState
 
 NEAR_WALL = 1.0  # m
 

@@ -27,7 +27,8 @@ from star.commander import Successors
 from star.config import AgentConfig
 from star.sgim import strategies
 from star.sgim.strategies import Lesson
-from star.state import Spec, TrainState
+from star.spec import Spec
+from star.state import TrainState
 from star.tutor import Box
 
 _ANY = 1_000_000  # a region to practise that is still to be drawn; larger than any index

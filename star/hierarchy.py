@@ -36,7 +36,8 @@ from star.sgim import selection, strategies
 from star.sgim.selection import SgimState
 from star.sgim.strategies import Lesson
 from star.sgim.teachers import Demonstrations
-from star.state import Spec, TrainState
+from star.spec import Spec
+from star.state import TrainState
 from star.tutor import Trace
 
 Metrics = dict[str, Array]

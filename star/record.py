@@ -17,7 +17,7 @@ from star import episode, trainer
 from star.config import Config, ConfigError
 from star.sgim import teachers
 from star.sgim.teachers import Demonstrations
-from star.state import Spec
+from star.spec import Spec
 
 
 class Moments(struct.PyTreeNode):

@@ -1,11 +1,13 @@
-"""Figures of a run: the regions over the maze, as they are and as they grew, and the success curve."""
+"""Figures of a run: the regions over the maze, as they are and as they grew, success, and what SGIM chose."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -13,6 +15,8 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from star.config import SgimConfig
+from star.sgim import selection
 from star.state import TrainState
 
 _MAX_PANELS = 5
@@ -21,19 +25,28 @@ _GROWTH_PANELS = 4
 Row = Mapping[str, Any]
 
 
-def region_rows(state: TrainState, seeds: Sequence[int], *, env_steps: int) -> list[dict[str, Any]]:
+def region_rows(state: TrainState, seeds: Sequence[int], *, env_steps: int, sgim: SgimConfig) -> list[dict[str, Any]]:
     """The abstraction of every seed (leading axis of `state`) as plain values, a row of `regions.jsonl` each.
 
-    `lower` and `upper` are the corners of the regions in use, `chosen` how often the Commander chose each of late.
+    `lower` and `upper` are the corners of the regions in use, `chosen` how often the Commander chose each of late. With
+    SGIM there are its `competence` in each region, and `drawn`, the share of its choices that fall there.
     """
-    tables = state.abstraction.lower, state.abstraction.upper, state.commander.chosen
-    lower, upper, chosen, count = (np.asarray(table) for table in (*tables, state.abstraction.count))
+    tables = {
+        "lower": state.abstraction.lower,
+        "upper": state.abstraction.upper,
+        "chosen": state.commander.chosen,
+    }
+    if state.sgim is not None:
+        tables["competence"] = jax.vmap(selection.competence)(state.sgim)
+        drawn = jax.vmap(partial(selection.probabilities, sgim.selection))(state.sgim)
+        tables["drawn"] = drawn.sum(axis=-1)
+    found, count = jax.device_get((tables, state.abstraction.count))
 
     def of(table: np.ndarray, index: int) -> list[Any]:
         return np.round(table[index, : count[index]].astype(float), 4).tolist()
 
     return [
-        {"seed": seed, "env_steps": env_steps, "lower": of(lower, i), "upper": of(upper, i), "chosen": of(chosen, i)}
+        {"seed": seed, "env_steps": env_steps} | {name: of(table, i) for name, table in found.items()}
         for i, seed in enumerate(seeds)
     ]
 
@@ -72,9 +85,36 @@ def growth_figure(
     _save(figure, path)
 
 
-def draw_regions(axis: Axes, row: Row, walls: np.ndarray) -> None:
-    """The first two abstract dimensions of the regions of a row, over the walls."""
-    lower, upper, chosen = (np.asarray(row[key], float) for key in ("lower", "upper", "chosen"))
+def sgim_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], walls: np.ndarray) -> None:
+    """Draw what SGIM chose: the share of every strategy and the competence over time, and the last map of interest.
+
+    Shares are means over seeds; the map is that of the first seed in `regions`.
+    """
+    steps = sorted({row["env_steps"] for row in rows})
+    prefix = "sgim/share_"
+    names = [key.removeprefix(prefix) for key in rows[0] if key.startswith(prefix)]
+
+    def curve(key: str) -> list[float]:
+        return [float(np.mean([row[key] for row in rows if row["env_steps"] == step])) for step in steps]
+
+    last = [row for row in regions if row["seed"] == regions[0]["seed"]][-1] if regions else None
+    figure = Figure(figsize=(10.4 if last else 5.8, 4.4), layout="constrained")
+    axes = figure.subplots(1, 2 if last else 1, squeeze=False)[0]
+    axes[0].stackplot(steps, [curve(prefix + name) for name in names], labels=names, alpha=0.7)
+    axes[0].plot(steps, curve("sgim/competence"), "k--", label="competence")
+    axes[0].set(xlabel="env steps", ylabel="share of episodes", ylim=(0, 1))
+    axes[0].legend(loc="upper left", fontsize="small")
+    if last:
+        draw_regions(axes[1], last, walls, by="drawn")
+        most = max([*last["drawn"], 1e-9])
+        scale = ScalarMappable(norm=Normalize(0, most), cmap="viridis")
+        figure.colorbar(scale, ax=axes[1], label=f"share of choices at {last['env_steps'] / 1e6:.3g} M env steps")
+    _save(figure, path)
+
+
+def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str = "chosen") -> None:
+    """The first two abstract dimensions of the regions of a row, coloured `by` one of its values, over the walls."""
+    lower, upper, chosen = (np.asarray(row[key], float) for key in ("lower", "upper", by))
     colours = ScalarMappable(norm=Normalize(0, max(float(chosen.max()), 1e-9)), cmap="viridis").to_rgba(chosen)
     for low, high, colour in zip(lower, upper, colours, strict=True):
         width, height = (high - low)[:2]
@@ -106,7 +146,8 @@ def draw_success(axis: Axes, rows: Sequence[Row]) -> None:
     axis.set_ylabel("success on test goals")
     axis.set_ylim(-0.02, 1.02)
     axis.grid(alpha=0.3)
-    axis.legend(loc="lower right")
+    if axis.lines:  # none before the first evaluation
+        axis.legend(loc="lower right")
 
 
 def _draw_panels(axes: Sequence[Axes], panels: Sequence[tuple[Row, str]], walls: np.ndarray) -> None:

@@ -1,18 +1,16 @@
-"""The state of a run: one pytree, and what its levels know of the environment."""
+"""The state of a run: one pytree."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Int
 
-from envs.maze import yaw
 from star import abstraction as regions
 from star import adjacency, commander, controller, forward_model, learner, refinement
 from star.abstraction import Abstraction
@@ -24,93 +22,8 @@ from star.refinement import Graph
 from star.replay import Transition
 from star.sgim import strategies
 from star.sgim.selection import SgimState
+from star.spec import Spec
 from star.tutor import Trace
-
-
-@dataclass(frozen=True)
-class Spec:
-    """What the levels know of the environment."""
-
-    state_dim: int
-    action_size: int
-    episode_length: int
-    abstract_indices: tuple[int, ...]
-    goal_indices: tuple[int, ...]
-    subgoal_scale: tuple[float, ...]
-    space: tuple[tuple[float, ...], tuple[float, ...]]
-    region_cuts: tuple[tuple[float, ...], ...]
-    success_radius: float
-    orientation: tuple[int, ...] = ()
-    """Indices of the body's unit quaternion (w, x, y, z) in the state; empty if it has none."""
-    heading: float | None = None
-    """Length, in m, of the heading vector that subgoals set too; None if they do not."""
-
-    @classmethod
-    def of(cls, env: Any, *, heading: float | None = None) -> Spec:
-        """Read the spec off an environment of `envs.make`."""
-        return cls(
-            state_dim=env.state_dim,
-            action_size=env.action_size,
-            episode_length=env.episode_length,
-            abstract_indices=tuple(env.abstract_indices),
-            goal_indices=tuple(env.goal_indices),
-            subgoal_scale=tuple(env.subgoal_scale),
-            space=(tuple(map(float, env.space[0])), tuple(map(float, env.space[1]))),
-            region_cuts=tuple(tuple(cut) for cut in env.region_cuts),
-            success_radius=float(env.success_radius),
-            orientation=tuple(env.orientation),
-            heading=heading,
-        )
-
-    @property
-    def scale(self) -> Float[Array, "p"]:
-        """Half-ranges of the Tutor's subgoals."""
-        return jnp.asarray(self.subgoal_scale + ((self.heading, self.heading) if self.heading else ()))
-
-    def state(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch state"]:
-        """The state part of an observation."""
-        return obs[..., : self.state_dim]
-
-    def goal(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch goal"]:
-        """The task goal g* in an observation."""
-        return obs[..., self.state_dim :]
-
-    def abstract(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch d"]:
-        """The abstract dimensions of an observation."""
-        return obs[..., np.asarray(self.abstract_indices)]
-
-    def pose(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch p"]:
-        """What subgoals are about: the abstract dimensions, and with a `heading` the vector of that length ahead.
-
-        The latter is (cos, sin) of the yaw, the angle about z, times the length: in the same unit as positions.
-        """
-        if not self.heading:
-            return self.abstract(obs)
-        facing = yaw(obs[..., np.asarray(self.orientation)])
-        ahead = self.heading * jnp.stack([jnp.cos(facing), jnp.sin(facing)], axis=-1)
-        return jnp.concatenate([self.abstract(obs), ahead], axis=-1)
-
-    def goal_point(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch d"]:
-        """g* as an abstract point; abstract dimensions that g* leaves open are those of the state."""
-        columns = [
-            self.goal(obs)[..., self.goal_indices.index(i)] if i in self.goal_indices else obs[..., i]
-            for i in self.abstract_indices
-        ]
-        return jnp.stack(columns, axis=-1)
-
-    def with_goal_point(
-        self, goal: Float[Array, "*batch goal"], point: Float[Array, "*batch d"]
-    ) -> Float[Array, "*batch goal"]:
-        """The task goal at an abstract `point`; what is not abstract in it stays as in `goal`."""
-        columns = [
-            point[..., self.abstract_indices.index(i)] if i in self.abstract_indices else goal[..., column]
-            for column, i in enumerate(self.goal_indices)
-        ]
-        return jnp.stack(columns, axis=-1)
-
-    def in_goal(self) -> Bool[Array, "d"]:
-        """Which abstract dimensions g* fixes."""
-        return jnp.asarray([i in self.goal_indices for i in self.abstract_indices])
 
 
 class TrainState(struct.PyTreeNode):

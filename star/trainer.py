@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -26,8 +26,10 @@ from star.config import Config, ConfigError, TeacherConfig
 from star.episode import Episode
 from star.loading import parse
 from star.metrics import Display, Journal, mean
-from star.sgim.teachers import Demonstrations, shortest_paths
-from star.state import Spec, TrainState
+from star.sgim import teachers
+from star.sgim.teachers import Demonstrations
+from star.spec import Spec
+from star.state import TrainState
 
 # Streams of random keys that no seed of training uses.
 _DURING_TRAINING = 2**32 - 1
@@ -42,6 +44,8 @@ class Program:
     spec: Spec
     walls: np.ndarray
     init: Callable[[jax.Array], TrainState]
+    lessons: Callable[[], tuple[Demonstrations, ...]]
+    """What the teachers show, read when it is first needed; raises `ConfigError`."""
     epoch: Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
     evaluate: Callable[[TrainState, jax.Array], Episode]
 
@@ -83,9 +87,13 @@ def build(config: Config) -> Program:
     except ValueError as error:
         raise ConfigError(str(error)) from None
     agent = config.agent()
-    lessons = tuple(_demonstrations(teacher, env) for teacher in config.sgim.teachers)
+    test_env = make_env(config, "test")
     trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
-    tested = VectorEnv(make_env(config, "test"), config.trainer.eval_episodes, auto_reset=False)
+    tested = VectorEnv(test_env, config.trainer.eval_episodes, auto_reset=False)
+
+    @cache
+    def lessons() -> tuple[Demonstrations, ...]:
+        return tuple(_demonstrations(config, teacher, env, test_env, spec) for teacher in config.sgim.teachers)
 
     def epoch(agent: Any, lessons: Any, state: TrainState) -> Any:
         return jax.vmap(partial(hierarchy.epoch, agent, spec, trained, teachers=lessons))(state)
@@ -100,7 +108,8 @@ def build(config: Config) -> Program:
         spec=spec,
         walls=np.asarray(env.arena.walls()),
         init=lambda keys: init(agent, keys),
-        epoch=lambda state: jitted_epoch(agent, lessons, state),
+        lessons=lessons,
+        epoch=lambda state: jitted_epoch(agent, lessons(), state),
         evaluate=lambda state, keys: jitted_evaluate(agent, state, keys),
     )
 
@@ -111,6 +120,7 @@ def train(
     """Train to the end, or go on with the run in `run_dir`. Ctrl-C writes a checkpoint and returns."""
     console = console or Console(stderr=True)
     program = build(config)
+    program.lessons()  # refused before anything is written
     checkpoints = Checkpoints(run_dir, keep=config.trainer.keep_checkpoints)
     journal = Journal.of(run_dir)
     if resume:
@@ -226,7 +236,7 @@ def _loop(
                 _add_evaluation(table, program.evaluate(state, evaluation_keys(program, done)))
                 success = mean(table, "eval/success_final")
                 if program.config.commander.enabled:
-                    regions.extend(report.region_rows(state, seeds, env_steps=env_steps))
+                    regions.extend(report.region_rows(state, seeds, env_steps=env_steps, sgim=program.config.sgim))
                     for region_row in regions[-len(seeds) :]:
                         journal.regions.write(region_row)
             for row in table:
@@ -242,10 +252,14 @@ def _loop(
         if saved != done:
             checkpoints.save(env_steps, state, program.config, success=_or_zero(success))
     if program.config.commander.enabled and not (regions and regions[-1]["env_steps"] == env_steps):
-        regions.extend(report.region_rows(state, seeds, env_steps=env_steps))  # stopped between evaluations
+        regions.extend(
+            report.region_rows(state, seeds, env_steps=env_steps, sgim=program.config.sgim)
+        )  # stopped between evaluations
     report.summary_figure(run_dir / "figures" / "summary.png", regions=regions, rows=rows, walls=program.walls)
     if regions:
         report.growth_figure(run_dir / "figures" / "growth.png", regions=regions, walls=program.walls)
+    if rows and program.config.sgim.enabled:
+        report.sgim_figure(run_dir / "figures" / "sgim.png", regions=regions, rows=rows, walls=program.walls)
     return Result(run_dir, env_steps, stopped, success)
 
 
@@ -318,9 +332,21 @@ def _resolve(config: Config, engine: str, spec: Spec) -> Config:
     return parse(values)
 
 
-def _demonstrations(teacher: TeacherConfig, env: Any) -> Demonstrations:
-    """What a teacher shows."""
-    return shortest_paths(env)
+def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: Any, spec: Spec) -> Demonstrations:
+    """What a teacher shows; raises `ConfigError` if that is not what it should be."""
+    if teacher.source == "map":
+        demos = teachers.shortest_paths(env)
+    else:
+        demos = teachers.load(Path(teacher.source), env=config.env.name, spec=spec)
+    if teacher.kind == "action" and demos.actions is None:
+        raise ConfigError(f"sgim.teachers: {teacher.source} shows no actions; {teacher.name} cannot be of kind action")
+    if teacher.flaw == "repetitive":
+        return teachers.repetitive(demos)
+    if teacher.flaw == "other_body":
+        return teachers.other_body(demos)
+    if teacher.flaw == "wrong_half":
+        return teachers.wrong_half(demos, spec.goal_point(tested.reset(jax.random.key(0)).obs))
+    return demos
 
 
 def make_env(config: Config, goals: str, **others: Any) -> Any:

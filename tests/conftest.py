@@ -21,6 +21,7 @@ from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
 from star import episode, hierarchy, loading, trainer  # noqa: E402
 from star.checkpoint import Checkpoints  # noqa: E402
+from star.spec import Spec
 
 settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
 settings.load_profile("star")
@@ -134,7 +135,7 @@ def breaking_env():
 @pytest.fixture(scope="session")
 def turning(breaking_env):
     """What the levels know of it if its whole state is read as a quaternion and subgoals set a heading."""
-    return replace(star.state.Spec.of(breaking_env.env, heading=2.0), orientation=(0, 1, 2, 3))
+    return replace(Spec.of(breaking_env.env, heading=2.0), orientation=(0, 1, 2, 3))
 
 
 def record(agent, spec, env, state, key):
@@ -185,7 +186,7 @@ def recording(request, breaking_env):
         "controller.reward_scale": 0.5,
     }
     parsed = loading.parse(TINY, overrides)
-    agent, spec = parsed.agent(), star.state.Spec.of(breaking_env.env)
+    agent, spec = parsed.agent(), Spec.of(breaking_env.env)
 
     def whole(key):
         state = star.state.init(agent, spec, key=key)

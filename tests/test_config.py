@@ -324,7 +324,7 @@ def test_an_error_names_all_files_it_may_come_from(write, tmp_path):
         load(write("tutor: {unroll: 2}"), layers=[layer])
 
 
-@pytest.mark.parametrize("folder", ["agents", "ablations"])
+@pytest.mark.parametrize("folder", ["agents", "ablations", "sgim"])
 def test_every_shipped_layer_fits_every_shipped_config(pytestconfig, folder):
     layers = sorted((pytestconfig.rootpath / "configs" / folder).glob("*.yaml"))
     assert len(layers) >= 5

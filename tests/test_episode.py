@@ -10,7 +10,7 @@ import envs
 import star.state
 from star import abstraction as regions
 from star import episode, loading
-from star.state import Spec
+from star.spec import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and the environments of the recording
 

@@ -8,7 +8,7 @@ import pytest
 import star.state
 from star import hierarchy, loading, refinement, replay
 from star.replay import Transition
-from star.state import Spec
+from star.spec import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and trainer.num_envs of the tiny hierarchy
 

@@ -12,7 +12,7 @@ from star import cli, record, trainer
 from star.loading import load
 from star.record import Moments
 from star.sgim import teachers
-from star.state import Spec
+from star.spec import Spec
 
 PERIOD = 20
 EPISODES = 200

@@ -14,7 +14,7 @@ from star.commander import Decision
 from star.evaluation import bootstrap
 from star.forward_model import Outcome
 from star.reachability import MISSES, REACHES
-from star.state import Spec
+from star.spec import Spec
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 

@@ -18,11 +18,13 @@ import numpy as np
 import pytest
 import yaml
 
+import envs
 from star import cli, report, trainer
 from star.checkpoint import Checkpoints
 from star.config import ConfigError
 from star.loading import load, parse
 from star.metrics import Journal, JsonLines
+from star.sgim import teachers
 
 ROOT = Path(__file__).parents[1]
 TIMES = ("wall_s", "env_steps_per_s")
@@ -161,6 +163,42 @@ def test_an_interrupted_run_resumes_to_the_same_final_state_bit_for_bit(finished
     assert rows(part) == rows(run_dir)
     assert Journal.of(part).regions.read() == Journal.of(run_dir).regions.read()
     assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+
+
+def test_sgim_is_written_down_drawn_and_resumed_bit_for_bit(tmp_path, monkeypatch):
+    guide = {"name": "guide", "kind": "decomposition", "max_queries": 3}
+    config = tiny(sgim__goals=True, sgim__strategies=["autonomous", "babbling"], sgim__teachers=[guide])
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    trainer.train(config, whole, quiet=True)
+    assert (whole / "figures" / "sgim.png").read_bytes().startswith(b"\x89PNG")
+    for row in rows(whole):
+        assert sum(row[f"sgim/share_{name}"] for name in config.sgim.names) == pytest.approx(1)
+        assert row["sgim/queries_guide"] <= 3
+    for row in Journal.of(whole).regions.read():
+        assert len(row["competence"]) == len(row["drawn"]) == len(row["chosen"])
+        assert sum(row["drawn"]) == pytest.approx(1, abs=1e-3)
+    interrupt_after(monkeypatch, epochs=1)
+    trainer.train(config, part, quiet=True)
+    monkeypatch.undo()
+    trainer.train(load(part / "config.yaml"), part, resume=True, quiet=True)
+    assert rows(part) == rows(whole)
+    assert_equal(saved_state(config, part), saved_state(config, whole))
+
+
+@pytest.mark.parametrize(
+    ("teacher", "told"),
+    [
+        ({"kind": "outcome", "source": "none.npz"}, "none.npz: no such file (did you mean routes.npz?)"),
+        ({"kind": "action", "source": "routes.npz"}, "sgim.teachers: routes.npz shows no actions; helper cannot be of"),
+    ],
+)
+def test_a_teacher_who_cannot_teach_is_refused_before_anything_is_written(tmp_path, monkeypatch, teacher, told):
+    monkeypatch.chdir(tmp_path)
+    teachers.save(Path("routes.npz"), teachers.shortest_paths(envs.make("point_maze")), env="point_maze")
+    with pytest.raises(ConfigError) as error:
+        trainer.train(tiny(sgim__teachers=[{"name": "helper", **teacher}]), tmp_path / "run", quiet=True)
+    assert str(error.value).startswith(told) and "\n" not in str(error.value)
+    assert not (tmp_path / "run").exists()
 
 
 def test_metrics_written_after_the_checkpoint_are_dropped_on_resume(finished, tmp_path):

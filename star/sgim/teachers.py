@@ -34,7 +34,7 @@ from envs import EnvError, files, routes
 from envs.arena import FREE, GOAL, ROBOT
 from star.config import ConfigError
 from star.loading import nearest_file
-from star.state import Spec
+from star.spec import Spec
 
 FORMAT = 1  # of files
 ENDINGS = (".npz",)

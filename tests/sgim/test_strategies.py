@@ -14,7 +14,7 @@ from star.loading import ConfigError
 from star.replay import Imitation, Transition
 from star.sgim import selection, strategies
 from star.sgim.teachers import Demonstrations, nearest
-from star.state import Spec
+from star.spec import Spec
 
 B, L = 64, 3
 GUIDE = {"name": "guide", "kind": "decomposition"}

@@ -15,7 +15,7 @@ from envs.tasks import TASKS, own
 from star.config import ConfigError
 from star.sgim import teachers
 from star.sgim.teachers import Demonstrations
-from star.state import Spec
+from star.spec import Spec
 
 SPEC = Spec(
     state_dim=4,
