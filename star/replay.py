@@ -57,7 +57,8 @@ def flatten(batch: Any) -> Any:
 
 def create(example: Any, *, size: int) -> Ring:
     """An empty ring of `size` items shaped like `example` (no leading axis)."""
-    return _buffer(size, 1).init(example)
+    ring = _buffer(size, 1).init(example)
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), ring)  # a weakly typed index compiles twice
 
 
 def add(ring: Ring, items: Any) -> Ring:

@@ -127,7 +127,7 @@ def train(
         state = _restore(program, checkpoints, journal)
     else:
         _prepare(run_dir, program.config)
-        state = program.init(seed_keys(program))
+        state = jax.device_put(program.init(seed_keys(program)), jax.devices()[0])  # as a restored one is
     try:
         return _loop(program, state, run_dir, checkpoints, journal, quiet=quiet, console=console)
     finally:
