@@ -145,7 +145,13 @@ def test_departures_name_the_settings_and_their_defaults():
     [
         pytest.param({}, id="ppo"),
         pytest.param(
-            {"tutor.learner": "td3", "controller.learner": "td3", "tutor.adjacency.enabled": True}, id="td3, adjacency"
+            {
+                "tutor.learner": "td3",
+                "controller.learner": "td3",
+                "tutor.adjacency.enabled": True,
+                "sgim.teachers": [{"name": "guide", "kind": "decomposition"}],
+            },
+            id="td3, adjacency, sgim",
         ),
     ],
 )
@@ -158,8 +164,12 @@ def test_every_metric_is_explained_and_every_explained_metric_exists(overrides):
         key
         for key, second, *_ in rows("docs/metrics.md")
         if not key.startswith(("tutor/", "controller/")) or second in learner
-        if overrides or not key.startswith("adjacency/")
+        if overrides or not key.startswith(("adjacency/", "sgim/"))
     }
+    names = {"share": ("autonomous", "guide"), "queries": ("guide",)}
+    for each in [key for key in explained if key.endswith("_NAME")]:
+        kind = each.removeprefix("sgim/").removesuffix("_NAME")
+        explained = explained - {each} | {f"sgim/{kind}_{name}" for name in names[kind]}
     assert explained == metrics | WRITTEN_BY_THE_TRAINER
 
 
