@@ -345,6 +345,7 @@ class SgimConfig(Section):
     )
     exploration: bool = Field(False, description="the Commander's random targets are drawn by progress")
     refinement: bool = Field(False, description="examine first what is half mastered and makes no progress")
+    waypoint_radius: float = Field(2.0, gt=0, description="m: so near a waypoint is passed")
     margin: float = Field(0.0, ge=0, description="learner q: what a teacher's choice is to be better by than others")
     imitation: float = Field(
         1.0, ge=0, description="weight of demonstrated actions in the loss of the Controller's actor"

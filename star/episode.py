@@ -183,13 +183,14 @@ def command(
             epsilon=epsilon,
             key=act_key,
         )
-        if lesson is not None:
-            lesson, imposed = strategies.impose(lesson, state.abstraction, region)
-            target = jnp.where(imposed >= 0, imposed, target)
         if config.commander.hold:
             there = (streams.env.metrics["success"] > 0) & (practice < 0)
             target = jnp.where(there, goal_region, target)
-    holds_goal = (target == goal_region) & (practice < 0)
+    aim, around_point = spec.goal_point(obs), (target == goal_region) & (practice < 0)
+    if config.commander.enabled and lesson is not None:
+        lesson, waypoint, guided = strategies.impose(config.sgim, lesson, spec.abstract(obs))
+        target = jnp.where(guided, locate(waypoint), target)
+        aim, around_point = jnp.where(guided[:, None], waypoint, aim), around_point | guided
     fresh = Streams(
         env=streams.env,
         clock=streams.clock,
@@ -197,7 +198,7 @@ def command(
         region=region,
         goal_region=goal_region,
         target=target,
-        box=target_box(config, spec, state.abstraction, target, holds_goal, spec.goal_point(obs)),
+        box=target_box(config, spec, state.abstraction, target, around_point, aim),
         start=spec.abstract(obs),
         reward=jnp.full_like(streams.reward, commander.start_reward(config.commander)),
         episode=streams.episode,
@@ -211,14 +212,14 @@ def target_box(
     spec: Spec,
     abstraction: Abstraction,
     target: Int[Array, "B"],
-    holds_goal: Bool[Array, "B"],
-    goal_point: Float[Array, "B d"],
+    around_point: Bool[Array, "B"],
+    point: Float[Array, "B d"],
 ) -> Box:
-    """Bounds that the Tutor is given: those of the target region, or g* +- margin where it `holds_goal`."""
+    """Bounds that the Tutor is given: those of the target region, or point +- margin (of g*, or a waypoint)."""
     margin = config.commander.goal_margin
-    around = holds_goal[:, None] & spec.in_goal()
+    around = around_point[:, None] & spec.in_goal()
     lower, upper = abstraction.lower[target], abstraction.upper[target]
-    return Box(lower=jnp.where(around, goal_point - margin, lower), upper=jnp.where(around, goal_point + margin, upper))
+    return Box(lower=jnp.where(around, point - margin, lower), upper=jnp.where(around, point + margin, upper))
 
 
 def choose_subgoal(

@@ -115,6 +115,16 @@ def competence(state: SgimState) -> Float[Array, "R"]:
     return _mean(state.competences, newer | older)
 
 
+def mastered(state: SgimState) -> Float[Array, "R d"]:
+    """The remembered goal of each region with the greatest competence, or its centre if none is remembered."""
+    newer, older = _halves(state)
+    known = newer | older
+    best = jnp.argmax(jnp.where(known, state.competences, -jnp.inf), axis=-1)
+    goal = jnp.take_along_axis(state.goals, best[:, None, None], axis=1)[:, 0]
+    centre = (state.abstraction.lower + state.abstraction.upper) / 2
+    return jnp.where(known.any(axis=-1)[:, None], goal, centre)
+
+
 def interest(config: SelectionConfig, state: SgimState) -> Float[Array, "R S"]:
     """What each strategy adds to the competence of each region, over its cost; 0 where that is nothing or unknown."""
     return jnp.where(state.abstraction.active[:, None], jnp.maximum(state.gains, 0.0) / state.costs, 0.0)

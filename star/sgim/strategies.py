@@ -2,10 +2,10 @@
 
     alone    autonomous      the three levels as ever
              babbling        random subgoals instead of the Tutor's
-             decomposition   the Commander first aims at another region, then at the goal
+             decomposition   first to what is mastered best in another region, then to the goal
     teacher  outcome         the goal is the demonstrated outcome nearest to it (emulation)
              action          so it is, and the Controller imitates the demonstrated actions (mimicry)
-             decomposition   the Commander aims at the regions along the demonstrated route
+             decomposition   along the demonstrated route, waypoint by waypoint
 
 The competence of an episode is c = 1 - min(1, d_T / d_0), d the distance to the ball of success around the goal.
 
@@ -94,15 +94,17 @@ def available(config: SgimConfig, state: SgimState, *, key: Array) -> Bool[Array
     return (jax.random.uniform(key, share.shape) < share) & (asked < _budgets(config))
 
 
-def impose(lesson: Lesson, abstraction: Abstraction, region: Int[Array, "B"]) -> tuple[Lesson, Int[Array, "B"]]:
-    """The lesson with all waypoints passed that lie in the agent's `region`, and the next one's region, -1 if none."""
+def impose(
+    config: SgimConfig, lesson: Lesson, position: Float[Array, "B d"]
+) -> tuple[Lesson, Float[Array, "B d"], Bool[Array, "B"]]:
+    """The lesson with all waypoints passed that are near to `position`, the next one, and whether there is one."""
     length = lesson.waypoints.shape[1]
-    where = jax.vmap(partial(_locate, abstraction))(lesson.waypoints)
     order = jnp.arange(length)
-    met = (where == region[:, None]) & (order >= lesson.leg[:, None])
+    near = jnp.linalg.norm(lesson.waypoints - position[:, None], axis=-1) < config.waypoint_radius
+    met = near & (order >= lesson.leg[:, None])
     leg = jnp.maximum(lesson.leg, jnp.max(jnp.where(met, order + 1, 0), axis=1))
-    target = jnp.take_along_axis(where, jnp.minimum(leg, length - 1)[:, None], axis=1)[:, 0]
-    return lesson.replace(leg=leg), jnp.where(leg < length, target, -1)
+    coming = jnp.minimum(leg, length - 1)[:, None, None]
+    return lesson.replace(leg=leg), jnp.take_along_axis(lesson.waypoints, coming, axis=1)[:, 0], leg < length
 
 
 def babbles(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
@@ -208,8 +210,8 @@ def _prepare(
     if "decomposition" in config.strategies:
         mine = choice.strategy == config.strategies.index("decomposition")
         via = jax.random.randint(key, mine.shape, 0, state.abstraction.count)
-        centre = (state.abstraction.lower[via] + state.abstraction.upper[via]) / 2
-        waypoints, guided = waypoints.at[:, 0].set(jnp.where(mine[:, None], centre, waypoints[:, 0])), guided | mine
+        by_way_of = selection.mastered(state)[via]
+        waypoints, guided = waypoints.at[:, 0].set(jnp.where(mine[:, None], by_way_of, waypoints[:, 0])), guided | mine
     for number, (teacher, demos) in enumerate(zip(config.teachers, teachers, strict=True), len(config.strategies)):
         mine = taught & (choice.strategy == number)
         if teacher.kind == "decomposition":

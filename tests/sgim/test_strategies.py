@@ -105,14 +105,19 @@ def test_each_teacher_shows_what_is_nearest_and_only_to_those_who_ask():
     np.testing.assert_array_equal(strategies.guided(config, lesson), asked == 1)
 
 
-def test_own_decomposition_goes_by_way_of_the_centre_of_a_region():
+def test_own_decomposition_goes_by_way_of_what_is_mastered_best_in_a_region():
     config = settings(strategies=["autonomous", "decomposition"])
-    lesson, _, goal, state = lesson_of(config)
+    state = strategies.init(config, four_regions())
+    competences = state.competences.at[1, :3].set(jnp.array([0.2, 0.9, 0.5]))
+    goals = state.goals.at[1, :3].set(jnp.array([[0.5, 2.5], [1.5, 3.5], [1.0, 3.0]]))
+    state = state.replace(competences=competences, goals=goals, written=state.written.at[1].set(3))
+    lesson = lesson_of(config, state)[0]
     mine = np.asarray(lesson.choice.strategy) == 1
     assert mine.any() and not mine.all()
-    centres = np.asarray((state.abstraction.lower + state.abstraction.upper) / 2)[:4]
+    via = np.array((state.abstraction.lower + state.abstraction.upper) / 2)[:4]
+    via[1] = [1.5, 3.5]  # of the others nothing is known: their centres
     first = np.asarray(lesson.waypoints[:, 0])
-    assert all(any((point == centre).all() for centre in centres) for point in first[mine])
+    assert all(any((point == one).all() for one in via) for point in first[mine])
     assert len(np.unique(first[mine], axis=0)) == 4
     np.testing.assert_array_equal(np.asarray(lesson.leg) == 0, mine)
     assert not strategies.guided(config, lesson).any()
@@ -143,21 +148,22 @@ def test_asking_evenly_pays_no_heed_to_progress():
     assert stats.chisquare(counts).pvalue > 1e-3
 
 
-def test_waypoints_are_passed_in_the_region_they_lie_in():
-    table = four_regions()
+def test_waypoints_are_passed_where_the_agent_is_near():
     rng = np.random.default_rng(0)
-    points = rng.uniform(0, 4, (B, L, 2)).astype(np.float32)
-    leg, region = rng.integers(0, L + 1, B), rng.integers(0, 4, B)
-    lesson = lesson_of(settings(teachers=[GUIDE]))[0].replace(waypoints=jnp.asarray(points), leg=jnp.asarray(leg))
-    after, target = jax.jit(strategies.impose)(lesson, table, jnp.asarray(region))
+    points, position = rng.uniform(0, 4, (B, L, 2)).astype(np.float32), rng.uniform(0, 4, (B, 2)).astype(np.float32)
+    leg = rng.integers(0, L + 1, B)
+    config = settings(teachers=[GUIDE], waypoint_radius=1.2)
+    lesson = lesson_of(config)[0].replace(waypoints=jnp.asarray(points), leg=jnp.asarray(leg))
+    after, coming, guided = jax.jit(strategies.impose)(config, lesson, jnp.asarray(position))
     passed = 0
     for b in range(B):
         expected = leg[b]
         for i in range(leg[b], L):
-            if located(points[b, i]) == region[b]:
+            if np.linalg.norm(points[b, i] - position[b]) < 1.2:
                 expected = i + 1
-        assert int(after.leg[b]) == expected
-        assert int(target[b]) == (located(points[b, expected]) if expected < L else -1)
+        assert int(after.leg[b]) == expected and bool(guided[b]) == (expected < L)
+        if expected < L:
+            np.testing.assert_array_equal(coming[b], points[b, expected])
         passed += expected > leg[b]
     assert passed > 5
 
