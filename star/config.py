@@ -284,19 +284,23 @@ class SelectionConfig(Section):
 
     window: Annotated[int, Field(ge=4)] = Field(80, description="episodes remembered of each region")
     per_block: Positive = Field(16, description="episodes of one block that each region remembers at most")
-    credit_rate: float = Field(
-        0.2, gt=0, le=1, description="rate at which an increment of competence changes what strategies are worth"
+    drift: float = Field(
+        0.001, gt=0, description="doubt about what a strategy adds grows by this in a block; it begins with 1"
+    )
+    optimism: float = Field(
+        0.005, ge=0, description="what the root of a doubt of 1 is worth (units of competence per block)"
     )
     forgetting: float = Field(
         0.0, ge=0, le=1, description="what lost competence is worth of an equal gain; 1 is absolute progress"
     )
-    random: float = Field(0.2, ge=0, le=1, description="share of choices drawn evenly")
+    random: float = Field(0.05, ge=0, le=1, description="share of choices drawn evenly")
     best: float = Field(0.2, ge=0, le=1, description="share of choices whose goal is near a region's best point")
-    explore: float = Field(0.1, ge=0, le=1, description="share of choices by interest whose strategy is drawn evenly")
     best_point: Literal["progress", "worst"] = Field(
         "progress", description="best point of a region: where competence grew most, or is lowest"
     )
-    sharpness: float = Field(2.0, gt=0, description="strategies are drawn in proportion to interest to this power")
+    sharpness: float = Field(
+        8.0, gt=0, description="choices are drawn in proportion to interest to this power; 2 for many at once"
+    )
     focus: float = Field(0.1, gt=0, le=1, description="how near: half-width as a share of the region's width")
     min_side: Positive = Field(8, description="remembered goals on each side of a cut at least")
     min_width: float = Field(1e-3, gt=0, description="no region is cut narrower than this (units of goals)")

@@ -1,9 +1,9 @@
 """Which region of goals to practise, with which strategy: where competence grows most for what it costs.
 
-    progress of region r        P_r  = mean competence of the newer half of its window - that of the older half
-    progress by strategy s      P_rs = what a block of episodes with s adds to the competence of r
-    interest                    I_rs = max(P_rs, 0) / cost_s
-    choice                      region ~ max(P_r, 0), then strategy ~ I_rs ^ sharpness; a share of both is random
+    progress by strategy s      P_rs = what a block of episodes with s adds to the competence of region r
+    doubt                       v_rs = how uncertain that is
+    interest                    I_rs = (max(P_rs, 0) + optimism sqrt(v_rs)) / cost_s
+    choice                      region and strategy ~ I_rs ^ sharpness; a share is random
 
 A block is what one call of `update` is told: a few episodes of one learner in a row, or an epoch of many environments.
 With m_b the mean competence in the b-th block that region r has a part in, and x_bs the share of strategy s in it,
@@ -11,14 +11,15 @@ With m_b the mean competence in the b-th block that region r has a part in, and 
     m_b - m_(b-1)  =  sum over s of f_s P_rs,        f = (x_(b-1) + x_b) / 2,
 
 as a block's mean stands for its middle: half of what is learnt between two middles is due to the block before. P_rs
-follows by the normalised least mean squares rule. A window of absolute competences could not tell a strategy that
-teaches from one that is merely played while others teach.
+follows by a Kalman filter with a diagonal covariance v, in units of the variance of the noise of an increment: 1 at
+first, less with every block that tells of s, and `drift` more in every block. A window of absolute competences could
+not tell a strategy that teaches from one that is merely played while others teach.
 
 All functions but `init` are pure and can be jitted, scanned and vmapped over independent learners. Shapes are
 static: R is the capacity for regions, S the number of strategies, W the window, d the dimensions of goals.
 
 Source: im = progress / cost of S. M. Nguyen's habilitation thesis; regions: SAGG-RIAC (Baranes and Oudeyer 2013);
-strategies: SGIM-ACTS (Nguyen and Oudeyer 2012).
+strategies: SGIM-ACTS (Nguyen and Oudeyer 2012); optimism: UCB1 (Auer, Cesa-Bianchi and Fischer 2002).
 """
 
 from __future__ import annotations
@@ -56,6 +57,8 @@ class SgimState(struct.PyTreeNode):
     """Share of each strategy in the last block of each region."""
     gains: Float[Array, "R S"]
     """P_rs, in units of competence per block."""
+    doubt: Float[Array, "R S"]
+    """v_rs, the variance of P_rs over that of the noise of an increment."""
     episodes: Float[Array, "R S"]
     """Episodes played in all."""
     refused: Int[Array, ""]
@@ -96,6 +99,7 @@ def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[floa
         mean=jnp.full(capacity, jnp.nan, jnp.float32),
         shares=jnp.zeros(pairs),
         gains=jnp.zeros(pairs),
+        doubt=jnp.ones(pairs),
         episodes=jnp.zeros(pairs),
         refused=jnp.zeros((), jnp.int32),
         blocks=jnp.zeros((), jnp.int32),
@@ -126,8 +130,12 @@ def mastered(state: SgimState) -> Float[Array, "R d"]:
 
 
 def interest(config: SelectionConfig, state: SgimState) -> Float[Array, "R S"]:
-    """What each strategy adds to the competence of each region, over its cost; 0 where that is nothing or unknown."""
-    return jnp.where(state.abstraction.active[:, None], jnp.maximum(state.gains, 0.0) / state.costs, 0.0)
+    """What each strategy adds to the competence of each region, if all goes well, over its cost; 0 if inactive.
+
+    Loss of competence is worth nothing, or with `forgetting` that share of a gain.
+    """
+    worth = jnp.maximum(state.gains, -config.forgetting * state.gains) + config.optimism * jnp.sqrt(state.doubt)
+    return jnp.where(state.abstraction.active[:, None], worth / state.costs, 0.0)
 
 
 def probabilities(
@@ -154,10 +162,9 @@ def select(
 ) -> Choice:
     """Draw a region and a strategy, and a goal in the region. Vmap over keys for many choices.
 
-    With probability `random` both are drawn evenly. Otherwise the region is drawn by its progress and the strategy by
-    its interest there; in a share `best` of all choices the goal then lies near the point of the region that
-    `best_point` names, else anywhere in it. Where `probabilities` leave nothing to choose, `log_prob` is minus infinity
-    and the rest means nothing.
+    With probability `random` both are drawn evenly, otherwise by their interest; in a share `best` of all choices the
+    goal then lies near the point of the region that `best_point` names, else anywhere in it. Where `probabilities`
+    leave nothing to choose, `log_prob` is minus infinity and the rest means nothing.
     """
     mode_key, region_key, strategy_key, goal_key = jax.random.split(key, 4)
     shares = jnp.stack([config.random, jnp.maximum(1 - config.random - config.best, 0.0), config.best])
@@ -223,6 +230,7 @@ def on_split(
         mean=state.mean.at[jnp.array([parent, child])].set(jnp.nan),
         shares=inherit(state.shares),
         gains=inherit(state.gains),
+        doubt=inherit(state.doubt),
         episodes=inherit(state.episodes.at[parent].multiply(0.5)),
     )
     for part, mine in ((parent, known & ~above), (child, known & above)):
@@ -282,11 +290,15 @@ def _distributions(
     strategies = jnp.ones_like(state.costs, bool) if available is None else available
     allowed = state.abstraction.active if admissible is None else state.abstraction.active & admissible
     wanted = interest(config, state) * strategies
-    wanted = (wanted / jnp.maximum(wanted.max(axis=-1, keepdims=True), 1e-30)) ** config.sharpness * (wanted > 0)
+    within = _sharpened(config, wanted)
+    between = _sharpened(config, wanted.max(axis=-1) * allowed) * within.sum(axis=-1)
     evenly = _shares(jnp.zeros_like(wanted), strategies)
-    by_interest = config.explore * evenly + (1 - config.explore) * _shares(wanted, strategies)
-    grown = _worth(config, progress(config, state))
-    return (_shares(jnp.zeros_like(grown), allowed), evenly), (_shares(grown, allowed), by_interest)
+    return (_shares(jnp.zeros_like(between), allowed), evenly), (_shares(between, allowed), _shares(within, strategies))
+
+
+def _sharpened(config: SelectionConfig, worth: Float[Array, "*n K"]) -> Float[Array, "*n K"]:
+    """`worth` to the power of `sharpness`, in units of the largest on the last axis; 0 stays 0."""
+    return (worth / jnp.maximum(worth.max(axis=-1, keepdims=True), 1e-30)) ** config.sharpness
 
 
 def _mixture(
@@ -301,11 +313,6 @@ def _shares(worth: Float[Array, "*n K"], mask: Bool[Array, "K"]) -> Float[Array,
     worth = worth * mask
     total = worth.sum(axis=-1, keepdims=True)
     return jnp.where(total > 0, worth / jnp.where(total > 0, total, 1.0), mask / mask.sum())
-
-
-def _worth(config: SelectionConfig, grown: Array) -> Array:
-    """What growth of a region's competence is worth: loss of it nothing, or with `forgetting` that share of a gain."""
-    return jnp.maximum(grown, -config.forgetting * grown)
 
 
 def _goal(config: SelectionConfig, state: SgimState, region: Array, mode: Array, *, key: Array) -> Float[Array, "d"]:
@@ -341,10 +348,12 @@ def _credit(config: SelectionConfig, state: SgimState, choice: Choice, competenc
     shares = jnp.where(present[:, None], played / jnp.maximum(count, 1.0)[:, None], state.shares)
     due = (shares + state.shares) / 2
     surprise = mean - state.mean - jnp.sum(due * state.gains, axis=-1)
-    step = config.credit_rate * surprise / jnp.maximum(jnp.square(due).sum(axis=-1), 1e-6)
-    credited = present & jnp.isfinite(state.mean)  # there was a block before
+    shared = due * state.doubt
+    rate = shared / (1 + jnp.sum(due * shared, axis=-1, keepdims=True))
+    credited = (present & jnp.isfinite(state.mean))[:, None]  # there was a block before
     return state.replace(
-        gains=state.gains + jnp.where(credited, step, 0.0)[:, None] * due,
+        gains=state.gains + jnp.where(credited, rate * surprise[:, None], 0.0),
+        doubt=state.doubt * (1 - jnp.where(credited, rate * due, 0.0)) + config.drift,
         shares=shares,
         mean=mean,
         episodes=state.episodes + played,

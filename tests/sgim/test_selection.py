@@ -10,7 +10,6 @@ from scipy import stats
 
 from star import abstraction as regions
 from star import sgim
-from star.sgim import selection
 
 R, S, D = 5, 3, 2  # capacity, of which four regions are active
 CONFIG = sgim.Config(window=6, per_block=3)
@@ -65,11 +64,11 @@ def practised(blocks, seed=0, config=CONFIG):
 class Slow:
     """The same with lists, region by region."""
 
-    def __init__(self, window, rate):
-        self.window, self.rate = window, rate
+    def __init__(self, config):
+        self.config = config
         self.remembered = [[] for _ in range(R)]
         self.last = [None] * R  # mean and shares of the block before
-        self.gains = np.zeros((R, S))
+        self.gains, self.doubt = np.zeros((R, S)), np.ones((R, S))
 
     def block(self, choice, competences):
         for r in range(R):
@@ -81,28 +80,26 @@ class Slow:
             if self.last[r] is not None:
                 due = (shares + self.last[r][1]) / 2
                 error = mean - self.last[r][0] - due @ self.gains[r]
-                self.gains[r] += self.rate * error * due / (due @ due)
+                rate = due * self.doubt[r] / (1 + due**2 @ self.doubt[r])
+                self.gains[r] += rate * error
+                self.doubt[r] *= 1 - rate * due
             self.last[r] = mean, shares
+        self.doubt += self.config.drift
 
     def progress(self, r):
-        last = self.remembered[r][-self.window :]
+        last = self.remembered[r][-self.config.window :]
         half = len(last) // 2
         return np.mean(last[-half:]) - np.mean(last[-2 * half : -half]) if half else 0.0
 
     def interest(self, r, s):
-        return max(self.gains[r, s], 0) / COSTS[s]
+        return (max(self.gains[r, s], 0) + self.config.optimism * self.doubt[r, s] ** 0.5) / COSTS[s]
 
-    def probability(self, config, available, admissible):
-        regions_, strategies = np.flatnonzero(admissible[:4]), np.flatnonzero(available)
-        grown = {r: max(self.progress(r), 0) for r in regions_}
+    def probability(self, available, admissible):
+        pairs = [(r, s) for r in np.flatnonzero(admissible[:4]) for s in np.flatnonzero(available)]
+        wanted = [self.interest(r, s) ** self.config.sharpness for r, s in pairs]
         total = np.zeros((R, S))
-        for r in regions_:
-            p = grown[r] / sum(grown.values()) if sum(grown.values()) > 0 else 1 / len(regions_)
-            wanted = {s: self.interest(r, s) ** config.sharpness for s in strategies}
-            for s in strategies:
-                q = wanted[s] / sum(wanted.values()) if sum(wanted.values()) > 0 else 1 / len(strategies)
-                q = config.explore / len(strategies) + (1 - config.explore) * q
-                total[r, s] = config.random / len(regions_) / len(strategies) + (1 - config.random) * p * q
+        for pair, worth in zip(pairs, wanted, strict=True):
+            total[pair] = self.config.random / len(pairs) + (1 - self.config.random) * worth / sum(wanted)
         return total
 
 
@@ -117,7 +114,7 @@ def test_probabilities_are_those_of_lists(seed, blocks, absent, barred):
     """No region gets more than `per_block` episodes of a block here, since any of them might be left out."""
     config = sgim.Config(window=16, per_block=8)
     state, history = practised(blocks, seed, config)
-    slow = Slow(16, config.credit_rate)
+    slow = Slow(config)
     for choice, competences in history:
         slow.block(choice, competences)
     for r in range(4):  # the order within a block is drawn at random: read it off the window
@@ -126,9 +123,10 @@ def test_probabilities_are_those_of_lists(seed, blocks, absent, barred):
     admissible = np.array([r not in barred for r in range(R)])
     found = np.asarray(probabilities(config, state, jnp.asarray(available), jnp.asarray(admissible)))
     np.testing.assert_allclose(
-        sgim.interest(config, state), [[slow.interest(r, s) for s in range(S)] for r in range(R)], atol=1e-5
+        sgim.interest(config, state)[:4], [[slow.interest(r, s) for s in range(S)] for r in range(4)], atol=1e-5
     )
-    np.testing.assert_allclose(found, slow.probability(config, available, admissible), atol=1e-3)
+    np.testing.assert_allclose(found, slow.probability(available, admissible), atol=1e-3)
+    np.testing.assert_allclose(sgim.progress(config, state)[:4], [slow.progress(r) for r in range(4)], atol=1e-5)
     np.testing.assert_allclose(found.sum(), 1, atol=1e-5)
     assert (found[:, ~available] == 0).all() and (found[~admissible] == 0).all() and (found[4] == 0).all()
 
@@ -167,7 +165,7 @@ def test_select_draws_as_often_as_probabilities_say():
     assert stats.chisquare(counts[possible], wanted / wanted.sum() * len(keys)).pvalue > 1e-3
     np.testing.assert_allclose(drawn.log_prob, np.log(expected[drawn.region, drawn.strategy]), rtol=1e-5)
     modes = np.bincount(drawn.mode, minlength=3) / len(keys)
-    np.testing.assert_allclose(modes, [0.2, 0.6, 0.2], atol=0.01)
+    np.testing.assert_allclose(modes, [0.05, 0.75, 0.2], atol=0.01)
 
 
 def test_goals_lie_in_their_region_and_near_its_best_point_if_the_mode_says_so():
@@ -321,10 +319,20 @@ def test_goals_near_a_face_stay_in_their_region():
 
 
 def test_lost_competence_is_worth_what_forgetting_says():
+    state = sgim.init(CONFIG, four_regions(), [1.0, 1.0])
+    state = state.replace(gains=jnp.broadcast_to(jnp.array([-0.3, 0.3]), (R, 2)))
     for forgetting, expected in ((0.0, 0.0), (0.5, 0.15), (1.0, 0.3)):
-        config = sgim.Config(forgetting=forgetting)
-        np.testing.assert_allclose(selection._worth(config, jnp.array(-0.3)), expected)
-        np.testing.assert_allclose(selection._worth(config, jnp.array(0.3)), 0.3)
+        config = sgim.Config(forgetting=forgetting, optimism=0.0)
+        np.testing.assert_allclose(sgim.interest(config, state)[0], [expected, 0.3])
+
+
+def test_what_was_not_tried_for_long_is_tried_again():
+    """All that was ever played has brought nothing; the pair that waits longest becomes the most interesting."""
+    state = sgim.init(CONFIG, four_regions(), [1.0, 1.0])
+    for region, strategy in [(0, 0), (0, 0), (0, 1), (0, 1)] + 40 * [(1, 0)]:
+        state = update(CONFIG, state, choice_of([region], [strategy], [[1.0, 1.0]]), jnp.array([0.5]))
+    interest = np.asarray(sgim.interest(CONFIG, state))
+    assert interest[2, 0] == interest[1, 1] > interest[0, 0] > interest[1, 0] > 0
 
 
 @pytest.mark.parametrize("costs", [[], [1.0, 0.0], [1.0, -2.0], [float("nan")], [[1.0, 2.0]]])
@@ -376,8 +384,15 @@ def test_a_cut_alone_credits_no_strategy():
 
 
 def test_an_absent_strategy_does_not_drown_the_differences_between_those_available():
-    config = sgim.Config(window=6, per_block=3, sharpness=20.0)
+    config = sgim.Config(window=6, per_block=3, sharpness=20.0, optimism=0.0)
     state, _ = practised(4, config=config)
     state = state.replace(gains=jnp.broadcast_to(jnp.array([0.1, 1e-4, 0.0]), (R, S)))
     shares = np.asarray(sgim.probabilities(config, state, jnp.array([False, True, True]))).sum(axis=0)
     assert shares[0] == 0 and shares[1] > 3 * shares[2]
+
+
+def test_a_barred_region_does_not_drown_the_differences_between_those_admissible():
+    state, _ = practised(4)
+    state = state.replace(gains=jnp.zeros((R, S)).at[:3, 0].set(jnp.array([1e6, 0.1, 0.05])))
+    shares = np.asarray(sgim.probabilities(CONFIG, state, None, jnp.arange(R) > 0)).sum(axis=1)
+    assert shares[0] == 0 and shares[1] > 3 * shares[2] > 0
