@@ -2,8 +2,8 @@
 
     python scripts/benchmark_selection.py [--seeds 16] [--blocks 2400] [--out results/sgim]
 
-Every selector runs with each of its constants; the table shows the constants with the largest AUC on that bed. Written
-are selection.json, table.md and curves.png.
+Every selector runs with each of its constants. The first table shows for each selector those with the largest mean AUC
+over all beds, the others those with the largest AUC on one bed. Written are selection.json, table.md and curves.png.
 
     AUC         mean over time of the mastery, the competence in all that can be learnt
     t90         episodes until the mastery exceeds .9, median over seeds
@@ -14,8 +14,9 @@ are selection.json, table.md and curves.png.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,12 @@ def all_beds() -> dict[str, tuple[Bed, list[int], list[int]]]:
     lower, upper = beds.frontier().regions.lower, beds.frontier().regions.upper
     above = [r for r in range(len(lower)) if upper[r, 0] <= lower[r, 1]]  # x_1 < x_2 everywhere
     six = {f"six regions, noise {noise:g}": (beds.six_regions(noise=noise), [4, 5], [3]) for noise in (0, 0.05, 0.2)}
-    return {**six, "frontier": (beds.frontier(), above, [2])}
+    walls = np.flatnonzero(beds.PLAN == "#").tolist()
+    return {
+        **six,
+        "frontier": (beds.frontier(), above, [2]),
+        "key and door": (beds.key_and_door(noise=0.05), walls, [2]),
+    }
 
 
 def all_selectors(bed: Bed) -> Iterator[tuple[str, str, Selector]]:
@@ -51,14 +57,9 @@ def all_selectors(bed: Bed) -> Iterator[tuple[str, str, Selector]]:
         rule = selectors.fixed_frequency(sgim.Config(), space, bed.strategies, teacher=teacher, every=every)
         yield "fixed frequency (SGIM-D)", f"every {every}", rule
     yield "SGIM", "defaults", selectors.sgim(sgim.Config(), space, costs)
-    for name, values in (
-        ("sharpness", (1.0, 4.0)),
-        ("credit_rate", (0.1, 0.4)),
-        ("window", (40, 160)),
-        ("random", (0.1,)),
-    ):
-        for value in values:
-            yield "SGIM, swept", f"{name} {value:g}", selectors.sgim(sgim.Config(**{name: value}), space, costs)
+    for sharpness, optimism in itertools.product((4.0, 8.0, 12.0), (0.003, 0.005, 0.01, 0.02)):
+        config = sgim.Config(sharpness=sharpness, optimism=optimism)
+        yield "SGIM, swept", f"sharpness {sharpness:g}, optimism {optimism}", selectors.sgim(config, space, costs)
     yield "SGIM, absolute progress", "forgetting 1", selectors.sgim(sgim.Config(forgetting=1.0), space, costs)
     for bonus in (0.001, 0.003, 0.01, 0.03):
         yield "UCB1", f"bonus {bonus}", selectors.ucb(*size, bonus=bonus)
@@ -78,6 +79,10 @@ def all_selectors(bed: Bed) -> Iterator[tuple[str, str, Selector]]:
         yield "Exp3", f"rate {rate}", selectors.exp3(*size, rate=rate)
         for share in (0.001, 0.01):
             yield "Exp3.S", f"rate {rate}, share {share}", selectors.exp3(*size, rate=rate, share=share)
+        yield "Exp4", f"rate {rate}", selectors.exp4(sgim.Config(), space, bed.strategies, rate=rate)
+    for every in (100, 250):
+        yield "ALP-GMM", f"every {every}", selectors.alp_gmm(space, bed.strategies, every=every)
+    yield "oracle", "knows the law", beds.oracle(bed)
 
 
 def measure(
@@ -101,6 +106,17 @@ def measure(
     }
 
 
+def fair(found: list[dict[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Of each selector the rows of all beds with the constants of largest mean AUC over beds; best selectors first."""
+    settings: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in found:
+        settings.setdefault((row["selector"], row["constants"]), []).append(row)
+    chosen: dict[str, list[dict[str, Any]]] = {}
+    for rows in sorted(settings.values(), key=lambda rows: -np.mean([row["auc"] for row in rows])):
+        chosen.setdefault(rows[0]["selector"], rows)
+    return list(chosen.values())
+
+
 def best(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Of each selector on each bed the constants with the largest AUC."""
     chosen: dict[tuple[str, str], dict[str, Any]] = {}
@@ -112,22 +128,35 @@ def best(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def table(found: list[dict[str, Any]]) -> str:
-    """A Markdown table for each bed, best selectors first."""
-    lines = []
-    for bed in dict.fromkeys(row["bed"] for row in found):
+    """A Markdown table of all beds and one for each, best selectors first."""
+    names = list(dict.fromkeys(row["bed"] for row in found))
+    lines = [
+        "**One setting for all beds**: AUC",
+        "",
+        f"| selector | constants | mean | {' | '.join(names)} |",
+        "|---|---|---|" + "---|" * len(names),
+    ]
+    for rows in fair(found):
+        mean = interval(np.mean([row["auc"] for row in rows], axis=0).tolist())
+        each = " | ".join(f"{np.mean(row['auc']):.3f}" for row in rows)
+        lines.append(f"| {rows[0]['selector']} | {rows[0]['constants']} | {mean} | {each} |")
+    for bed in names:
         lines += [
+            "",
             f"**{bed}**",
             "",
             "| selector | constants | AUC | t90 | hopeless | idle |",
             "|---|---|---|---|---|---|",
         ]
-        rows = sorted((row for row in best(found) if row["bed"] == bed), key=lambda row: -np.mean(row["auc"]))
-        for row in rows:
-            auc = "{:.3f} [{:.3f}, {:.3f}]".format(*bootstrap(row["auc"], np.mean))
+        for row in sorted((row for row in best(found) if row["bed"] == bed), key=lambda row: -np.mean(row["auc"])):
             rest = f"{np.median(row['t90']):,.0f} | {row['hopeless']:.2f} | {row['idle']:.2f}"
-            lines.append(f"| {row['selector']} | {row['constants']} | {auc} | {rest} |")
-        lines.append("")
-    return "\n".join(lines)
+            lines.append(f"| {row['selector']} | {row['constants']} | {interval(row['auc'])} | {rest} |")
+    return "\n".join([*lines, ""])
+
+
+def interval(auc: Sequence[float]) -> str:
+    """Mean over seeds and its interval."""
+    return "{:.3f} [{:.3f}, {:.3f}]".format(*bootstrap(auc, np.mean))
 
 
 def draw(found: list[dict[str, Any]], blocks: int, path: Path) -> None:

@@ -183,3 +183,22 @@ def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
     assert row["misses"] == {"share": 0.5, "rollouts": 2, "pairs": 1}
     assert row["base"]["rollouts"] == 7 and row["error"]["still"] == pytest.approx(18**0.5)
     assert row["walls"]["share"] == 0.5  # of 4 faces, 2 at x = 8 beside the wall's side at 7.5 and 2 at y = 8
+
+
+def test_the_fair_table_takes_one_setting_of_each_selector_for_all_beds():
+    script = load("benchmark_selection")
+    rest = {"t90": [1, 1], "hopeless": 0.0, "idle": 0.0}
+    found = [
+        {"bed": bed, "selector": name, "constants": constants, "auc": [auc, auc + 0.02]} | rest
+        for bed, name, constants, auc in [
+            ("a", "first", "1", 0.9), ("a", "first", "2", 0.7), ("a", "second", "", 0.6),
+            ("b", "first", "1", 0.1), ("b", "first", "2", 0.5), ("b", "second", "", 0.8),
+        ]
+    ]  # fmt: skip
+    assert [(rows[0]["selector"], rows[0]["constants"]) for rows in script.fair(found)] == [
+        ("second", ""),
+        ("first", "2"),
+    ]
+    lines = script.table(found).splitlines()
+    assert "| first | 2 | 0.610 [0.600, 0.620] | 0.710 | 0.510 |" in lines
+    assert any(line.startswith("| first | 1 | 0.910") for line in lines)  # the best of bed a alone

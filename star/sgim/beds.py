@@ -140,3 +140,67 @@ def frontier(*, noise: float = 0.05) -> Bed:
         play=play,
         mastery=lambda front: jnp.clip(front / 1.4, 0.0, 1.0),
     )
+
+
+PLAN = np.array([list(row) for row in ("...#..", "...#..", "...+..", ".K.#..", "...#..")])
+"""Free cells, walls #, the door + and the key K."""
+
+
+def key_and_door(*, noise: float = 0.0) -> Bed:
+    """A grid of cells in two rooms; nothing is learnt in the door and the room behind it before the key is mastered.
+
+    A goal is a point in [0, 5) x [0, 6), in the cell of `PLAN` in row floor(x_1) and column floor(x_2). Practising cell
+    c once does C_c += g (1 - C_c), and with g / 4 the same to the cells that share a side with it; never to walls, and
+    to the door and what lies behind it only if the key's C > .7. Strategies: autonomous, g = .01, behind the door .002;
+    a teacher who knows the way through, g = .02 behind the door, else 0; a poor teacher, who whatever the goal has the
+    first cell practised, with g = .01. What is observed is C of the goal's cell + N(0, noise^2).
+    """
+    rows, columns = PLAN.shape
+    wall, behind = PLAN == "#", np.arange(columns) >= 3
+    key_cell = tuple(np.argwhere(PLAN == "K")[0])
+    gains = jnp.array([[0.01, 0.0, 0.01], [0.002, 0.02, 0.01]])  # [behind, strategy]
+    first, down, along = np.zeros(2, int), jnp.arange(rows)[:, None], jnp.arange(columns)
+
+    def play(latent: Array, region: Array, strategy: Array, goals: Array, late: Array, *, key: Array) -> tuple:
+        def one(skill: Array, cell: Array) -> tuple[Array, Array]:
+            practised = jnp.where(strategy == 2, first, cell)
+            steps = jnp.abs(down - practised[0]) + jnp.abs(along - practised[1])
+            spread = jnp.select([steps == 0, steps == 1], [1.0, 0.25], 0.0)
+            open_ = ~wall & (~behind | (skill[key_cell] > 0.7))
+            gain = gains[jnp.asarray(behind, int)[practised[1]], strategy] * open_[tuple(practised)]
+            skill = skill + gain * spread * open_ * (1 - skill)
+            return skill, skill[tuple(cell)]
+
+        latent, seen = jax.lax.scan(one, latent, jnp.floor(goals).astype(int))
+        return latent, seen + noise * jax.random.normal(key, seen.shape)
+
+    return Bed(
+        regions=create(((0.0, 0.0), (rows, columns)), (range(1, rows), range(1, columns)), max_regions=rows * columns),
+        strategies=3,
+        start=jnp.zeros(PLAN.shape),
+        play=play,
+        mastery=lambda skill: skill.sum() / (~wall).sum(),
+    )
+
+
+def oracle(bed: Bed, *, episodes: int = 16) -> Selector:
+    """Knows the law of the bed and its latent state: takes the arm with which one episode adds most to the mastery.
+
+    The gain is a mean over `episodes` goals in the region. Greedy: what an arm makes possible later counts nothing.
+    """
+    lower, upper = bed.regions.lower, bed.regions.upper
+    late, unused = jnp.array(False), jax.random.key(0)
+
+    def select(latent: Any, *, key: Array) -> tuple[Array, Array]:
+        def gain(region: Array, strategy: Array) -> Array:
+            goals = jax.random.uniform(key, (episodes, lower.shape[1]), minval=lower[region], maxval=upper[region])
+            once = jax.vmap(lambda goal: bed.mastery(bed.play(latent, region, strategy, goal, late, key=unused)[0]))
+            return once(goals[:, None]).mean()
+
+        gains = jax.vmap(jax.vmap(gain, (None, 0)), (0, None))(jnp.arange(len(lower)), jnp.arange(bed.strategies))
+        return jnp.unravel_index(jnp.argmax(gains), gains.shape)
+
+    def update(latent: Any, region: Array, strategy: Array, goals: Array, competences: Array) -> Any:
+        return bed.play(latent, region, strategy, goals, late, key=unused)[0]
+
+    return Selector(bed.start, select, update)

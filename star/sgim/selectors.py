@@ -3,8 +3,9 @@
 A selector chooses, for every block of episodes, a region and a strategy: an arm (r, s) of R x S. Those that need a
 reward are given the increment of the mean competence of r over its block before: learning progress by this arm.
 
-Sources: UCB1 (Auer et al. 2002), discounted and sliding-window UCB (Garivier and Moulines 2011), Exp3 and Exp3.S (Auer
-et al. 2002) with rewards rescaled by their quantiles (Graves et al. 2017), SGIM-D (Nguyen and Oudeyer 2014).
+Sources: UCB1 (Auer, Cesa-Bianchi and Fischer 2002), discounted and sliding-window UCB (Garivier and Moulines 2011),
+Exp3, Exp3.S and Exp4 (Auer, Cesa-Bianchi, Freund and Schapire 2002) with rewards rescaled by their quantiles (Graves et
+al. 2017), ALP-GMM (Portelas et al. 2019), SGIM-D (Nguyen and Oudeyer 2014).
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from star.abstraction import Abstraction
+from star.abstraction import Abstraction, locate
 from star.config import SelectionConfig
-from star.sgim import selection
-from star.sgim.selection import Choice
+from star.sgim import mixtures, selection
+from star.sgim.mixtures import Mixture
+from star.sgim.selection import Choice, SgimState
 
-HISTORY = 256  # increments whose quantiles rescale the rewards of Exp3
+HISTORY = 256  # increments whose quantiles rescale the rewards of Exp3 and Exp4
 
 
 class Selector(NamedTuple):
@@ -74,7 +76,7 @@ def fixed_frequency(
     rule = sgim(config, abstraction, [1.0] * strategies)
 
     def select(state: Any, *, key: Array) -> tuple[Array, Array]:
-        region, _ = rule.select(state, key=key)
+        region = jax.random.categorical(key, jnp.log(_by_progress(config, state)))
         return region, jnp.where(state.blocks % every == every - 1, teacher, 0)
 
     return Selector(rule.state, select, rule.update)
@@ -111,7 +113,7 @@ def ucb(regions: int, strategies: int, *, bonus: float, discount: float = 1.0, w
 
 
 def exp3(regions: int, strategies: int, *, rate: float, explore: float = 0.1, share: float = 0.0) -> Selector:
-    """Exp3, and with `share` > 0 Exp3.S: increments between their 20 % and 80 % quantiles become rewards in [-1, 1]."""
+    """Exp3, and with `share` > 0 Exp3.S, on rescaled increments."""
     arms = regions * strategies
     start = (jnp.full(regions, jnp.nan), jnp.zeros(arms), jnp.zeros(HISTORY), jnp.zeros((), jnp.int32))
 
@@ -124,10 +126,7 @@ def exp3(regions: int, strategies: int, *, rate: float, explore: float = 0.1, sh
     def update(state: Any, region: Array, strategy: Array, goals: Array, competences: Array) -> Any:
         mean, weights, history, n = state
         mean, increment = _increment(mean, region, competences)
-        history = history.at[n % HISTORY].set(increment)
-        seen = jnp.where(jnp.arange(HISTORY) <= n, history, jnp.nan)
-        low, high = jnp.nanquantile(seen, jnp.array([0.2, 0.8]))
-        scaled = jnp.clip(2 * (increment - low) / jnp.maximum(high - low, 1e-9) - 1, -1.0, 1.0)
+        history, scaled = _rescaled(history, n, increment)
         arm = region * strategies + strategy
         weights = weights.at[arm].add(rate * scaled / distribution(weights)[arm])
         if share:
@@ -138,10 +137,121 @@ def exp3(regions: int, strategies: int, *, rate: float, explore: float = 0.1, sh
     return Selector(start, select, update)
 
 
+def exp4(
+    config: SelectionConfig, abstraction: Abstraction, strategies: int, *, rate: float, explore: float = 0.1
+) -> Selector:
+    """Exp4 on rescaled increments.
+
+    Its experts: any arm, evenly; each strategy alone, in regions by progress; SGIM itself.
+    """
+    rule = sgim(config, abstraction, [1.0] * strategies)
+    arms = abstraction.capacity * strategies
+    none = jnp.full(abstraction.capacity, jnp.nan)
+    start = (rule.state, none, jnp.zeros(strategies + 2), jnp.zeros(HISTORY), jnp.zeros((), jnp.int32))
+
+    def advice(known: Any) -> Float[Array, "experts arms"]:
+        alone = _by_progress(config, known)[:, None] * jnp.eye(strategies)[:, None]
+        own = selection.probabilities(config, known)
+        return jnp.stack([jnp.full(arms, 1 / arms), own.ravel(), *alone.reshape(strategies, arms)])
+
+    def distribution(weights: Array, advised: Array) -> Float[Array, "arms"]:
+        return (1 - explore) * jax.nn.softmax(weights) @ advised + explore / arms
+
+    def select(state: Any, *, key: Array) -> tuple[Array, Array]:
+        known, _, weights, *_ = state
+        return _arm(jax.random.categorical(key, jnp.log(distribution(weights, advice(known)))), strategies)
+
+    def update(state: Any, region: Array, strategy: Array, goals: Array, competences: Array) -> Any:
+        known, mean, weights, history, n = state
+        mean, increment = _increment(mean, region, competences)
+        history, scaled = _rescaled(history, n, increment)
+        advised, arm = advice(known), region * strategies + strategy
+        weights = weights + rate * advised[:, arm] * scaled / distribution(weights, advised)[arm]
+        known = rule.update(known, region, strategy, goals, competences)
+        return known, mean, weights - weights.max(), history, n + 1
+
+    return Selector(start, select, update)
+
+
+def alp_gmm(
+    abstraction: Abstraction,
+    strategies: int,
+    *,
+    every: int = 250,
+    most: int = 8,
+    random: float = 0.2,
+    memory: int = 12_000,
+) -> Selector:
+    """ALP-GMM: goals by absolute learning progress, strategies evenly.
+
+    The progress at a goal is how far its competence is from that of the nearest goal of the last `memory`. Once in
+    `every` episodes a mixture of at most `most` Gaussians is fitted to as many (goal, progress). Goals are drawn from
+    Gaussians in proportion to their mean progress, a share `random` anywhere; what is chosen is the region of the goal.
+    """
+    d = abstraction.lower.shape[1]
+    low, high = abstraction.space
+    empty = Mixture(
+        weights=jnp.zeros(most), means=jnp.zeros((most, d + 1)), covariances=jnp.zeros((most, d + 1, d + 1))
+    )
+    start = (jnp.zeros((memory, d)), jnp.zeros(memory), jnp.zeros((every, d + 1)), empty, jnp.zeros((), jnp.int32))
+
+    def select(state: Any, *, key: Array) -> tuple[Array, Array]:
+        *_, mixture, n = state
+        random_key, even_key, part_key, goal_key, strategy_key = jax.random.split(key, 5)
+        part = jax.random.categorical(part_key, jnp.log(mixture.weights > 0) + jnp.log(mixture.means[:, -1]))
+        mean, covariance = mixture.means[part, :d], mixture.covariances[part, :d, :d]
+        drawn = jax.random.multivariate_normal(goal_key, mean, covariance)
+        even = jax.random.uniform(even_key, (d,), minval=low, maxval=high)
+        anywhere = (n < every) | jax.random.bernoulli(random_key, random) | ~jnp.isfinite(drawn).all()
+        region = locate(abstraction, jnp.where(anywhere, even, drawn))
+        return region, jax.random.randint(strategy_key, (), 0, strategies)
+
+    def update(state: Any, region: Array, strategy: Array, goals: Array, competences: Array) -> Any:
+        remembered, reached, points, mixture, n = state
+        apart = jnp.square(goals[:, None] - remembered).sum(axis=-1)
+        nearest = jnp.argmin(jnp.where(jnp.arange(memory) < n, apart, jnp.inf), axis=-1)
+        progress = jnp.where(n > 0, jnp.abs(competences - reached[nearest]), 0.0)
+        slots = n + jnp.arange(len(goals))
+        points = points.at[slots % every].set(jnp.concatenate([goals, progress[:, None]], axis=-1))
+        remembered = remembered.at[slots % memory].set(goals)
+        reached = reached.at[slots % memory].set(competences)
+        due = (n + len(goals)) // every > n // every
+        mixture = jax.lax.cond(due, lambda: _fitted(points, most, key=jax.random.key(n)), lambda: mixture)
+        return remembered, reached, points, mixture, n + len(goals)
+
+    return Selector(start, select, update)
+
+
+def _fitted(points: Float[Array, "n d"], most: int, *, key: Array) -> Mixture:
+    """The best mixture in the units of `points`, which are brought to unit scale for the fit."""
+    middle, scale = points.mean(axis=0), points.std(axis=0) + 1e-6
+    mixture = mixtures.best_fit((points - middle) / scale, most=most, key=key)
+    return Mixture(
+        weights=mixture.weights,
+        means=middle + scale * mixture.means,
+        covariances=scale[:, None] * scale * mixture.covariances,
+    )
+
+
+def _by_progress(config: SelectionConfig, state: SgimState, *, random: float = 0.2) -> Float[Array, "R"]:
+    """Probabilities of regions in proportion to the progress over their windows; a share `random` is even."""
+    grown, even = jnp.maximum(selection.progress(config, state), 0.0), 1 / len(state.written)
+    total = grown.sum()
+    return random * even + (1 - random) * jnp.where(total > 0, grown / jnp.where(total > 0, total, 1.0), even)
+
+
 def _increment(mean: Float[Array, "R"], region: Array, competences: Array) -> tuple[Float[Array, "R"], Array]:
     """Mean competence of each region in its last block after this one, and the increment; 0 where `mean` is NaN yet."""
     now = competences.mean()
     return mean.at[region].set(now), jnp.where(jnp.isnan(mean[region]), 0.0, now - mean[region])
+
+
+def _rescaled(history: Float[Array, "HISTORY"], n: Array, increment: Array) -> tuple[Float[Array, "HISTORY"], Array]:
+    """History with the n-th increment, and this brought from between its 20 % and 80 % quantiles to [-1, 1]."""
+    history = history.at[n % HISTORY].set(increment)
+    seen = jnp.where(jnp.arange(HISTORY) <= n, history, jnp.nan)
+    low, high = jnp.nanquantile(seen, jnp.array([0.2, 0.8]))
+    return history, jnp.clip(2 * (increment - low) / jnp.maximum(high - low, 1e-9) - 1, -1.0, 1.0)
 
 
 def _arm(arm: Array, strategies: int) -> tuple[Array, Array]:

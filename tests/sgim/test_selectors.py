@@ -4,12 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from star import abstraction as regions
 from star import sgim
-from star.sgim import beds, selectors
+from star.sgim import beds, mixtures, selectors
 
 R, S = 3, 2
+SPACE = regions.create(((0.0,), (3.0,)), ((1.0, 2.0),), max_regions=R)
 
 
 def play(rule, mean, blocks, seed=0):
@@ -20,7 +22,7 @@ def play(rule, mean, blocks, seed=0):
         region, strategy = (int(x) for x in select(state, key=key))
         chosen.append((region, strategy))
         competences = jnp.full(4, mean(t, region, strategy), jnp.float32)
-        state = update(state, region, strategy, jnp.zeros((4, 1)), competences)
+        state = update(state, region, strategy, region + jax.random.uniform(key, (4, 1)), competences)
     return chosen
 
 
@@ -58,8 +60,16 @@ def test_ucb_takes_the_arm_of_the_largest_bound(settings):
         history.append(((r, s), increment))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01], ids=["Exp3", "Exp3.S"])
-def test_exp3_comes_to_prefer_the_arm_that_makes_progress(share):
+@pytest.mark.parametrize(
+    "rule",
+    [
+        selectors.exp3(R, S, rate=0.03),
+        selectors.exp3(R, S, rate=0.03, share=0.01),
+        selectors.exp4(sgim.Config(optimism=1.0), SPACE, S, rate=0.03),
+    ],
+    ids=["Exp3", "Exp3.S", "Exp4"],
+)
+def test_the_arm_that_makes_progress_comes_to_be_preferred(rule):
     """Competence of region 1 rises with strategy 0 and falls with strategy 1; elsewhere nothing changes."""
     level = [0.0]
 
@@ -68,15 +78,75 @@ def test_exp3_comes_to_prefer_the_arm_that_makes_progress(share):
             level[0] += 0.1 if s == 0 else -0.1
         return level[0] if r == 1 else 0.5
 
-    chosen = play(selectors.exp3(R, S, rate=0.03, share=share), mean, 600)
+    chosen = play(rule, mean, 600)
     late = chosen[300:]
     assert late.count((1, 0)) > 2 * max(late.count((r, s)) for r in range(R) for s in range(S) if (r, s) != (1, 0))
 
 
 def test_fixed_frequency_asks_its_teacher_in_every_nth_block():
-    space = regions.create(((0.0,), (3.0,)), ((1.0, 2.0),), max_regions=R)
-    rule = selectors.fixed_frequency(sgim.Config(), space, S, teacher=1, every=3)
+    rule = selectors.fixed_frequency(sgim.Config(), SPACE, S, teacher=1, every=3)
     assert [s for _, s in play(rule, lambda *_: 0.5, 9)] == [0, 0, 1] * 3
+
+
+def test_exp4_trusts_its_experts_as_in_a_loop():
+    """SGIM's optimism makes its own advice almost even; that of the strategies follows progress, the same for both."""
+    rule, config = selectors.exp4(sgim.Config(optimism=1e3), SPACE, S, rate=0.2), sgim.Config(optimism=1e3)
+    update, probabilities = jax.jit(rule.update), jax.jit(sgim.probabilities)
+    rng, state, weights, seen, last = np.random.default_rng(0), rule.state, np.zeros(2 + S), [], [None] * R
+    for _ in range(60):
+        region, strategy = rng.integers(R), rng.integers(S)
+        competences = np.full(4, rng.uniform(), np.float32)
+        grown = np.maximum(np.asarray(sgim.progress(config, state[0])), 0)
+        where = 0.2 / R + 0.8 * (grown / grown.sum() if grown.sum() > 0 else np.full(R, 1 / R))
+        own = np.asarray(probabilities(config, state[0]))[region, strategy]
+        advised = np.array([1 / (R * S), own, *(where[region] * (s == strategy) for s in range(S))])
+        trust = np.exp(weights - weights.max())
+        probability = 0.9 * trust @ advised / trust.sum() + 0.1 / (R * S)
+        seen.append(0.0 if last[region] is None else competences[0] - last[region])
+        last[region] = competences[0]
+        low, high = np.quantile(seen, [0.2, 0.8])
+        reward = np.clip(2 * (seen[-1] - low) / max(high - low, 1e-9) - 1, -1, 1)
+        weights += 0.2 * advised * reward / probability
+        state = update(state, region, strategy, region + jnp.full((4, 1), 0.5), jnp.asarray(competences))
+    np.testing.assert_allclose(state[2], weights - weights.max(), atol=0.02)
+    assert np.ptp(weights) > 0.5
+
+
+def test_a_step_of_expectation_maximisation_is_that_of_a_loop():
+    rng = np.random.default_rng(0)
+    points, means = rng.normal(size=(20, 2)), rng.normal(size=(3, 2))
+    weights, covariances = np.array([0.5, 0.3, 0.2]), np.array([np.eye(2), 2 * np.eye(2), [[1, 0.5], [0.5, 1]]])
+    density = [
+        w * stats.multivariate_normal(m, c).pdf(points) for w, m, c in zip(weights, means, covariances, strict=True)
+    ]
+    blame = np.array(density) / np.sum(density, axis=0)
+    before = mixtures.Mixture(*(jnp.asarray(x, jnp.float32) for x in (weights, means, covariances)))
+    after = mixtures.improve(before, jnp.asarray(points, jnp.float32), floor=0.1)
+    for k in range(3):
+        middle = np.average(points, axis=0, weights=blame[k])
+        np.testing.assert_allclose(after.weights[k], blame[k].mean(), rtol=1e-3)
+        np.testing.assert_allclose(after.means[k], middle, rtol=1e-3, atol=1e-4)
+        spread = np.cov(points.T, aweights=blame[k], ddof=0) + 0.1 * np.eye(2)
+        np.testing.assert_allclose(after.covariances[k], spread, rtol=1e-3, atol=1e-4)
+
+
+def test_as_many_gaussians_are_fitted_as_there_are_clusters():
+    rng = np.random.default_rng(1)
+    for centres in ([0.0], [-1.0, 1.0]):
+        points = np.concatenate([rng.normal(centre, 0.2, (60, 1)) for centre in centres])
+        found = mixtures.best_fit(jnp.asarray(points, jnp.float32), most=2, key=jax.random.key(0))
+        used = np.asarray(found.weights) > 0
+        np.testing.assert_allclose(np.sort(np.asarray(found.means)[used, 0]), centres, atol=0.1)
+
+
+def test_alp_gmm_draws_goals_where_competence_changes_either_way():
+    rng = np.random.default_rng(0)
+    rule = selectors.alp_gmm(SPACE, S, every=60, most=3, memory=400)
+    chosen = play(rule, lambda t, r, s: rng.uniform() if r == 1 else 0.5, 120)
+    assert all(5 < [r for r, _ in chosen[:15]].count(r) + 4 for r in range(R))  # anywhere before the first fit
+    late = chosen[30:]
+    assert [r for r, _ in late].count(1) > 0.6 * len(late)
+    assert 0.3 < np.mean([s for _, s in late]) < 0.7
 
 
 def test_the_frontier_is_moved_by_practice_near_it_and_by_the_teacher_only_up_to_where_he_knows():
@@ -95,3 +165,53 @@ def test_the_frontier_is_moved_by_practice_near_it_and_by_the_teacher_only_up_to
     assert abs(moved(0.7, 1, [0.7, 0.0])) < 1e-6
     seen = bed.play(jnp.array(0.3), jnp.array(0), jnp.array(0), jnp.array([[0.3, 0.0], [0.1, 0.28]]), late, key=key)[1]
     np.testing.assert_allclose(seen, [0.5, 0.0], atol=0.01)
+
+
+def test_practice_in_the_grid_is_that_of_a_loop():
+    """Also in walls, before the key and after it, with the poor teacher, and across the door."""
+    bed, rng = beds.key_and_door(), np.random.default_rng(0)
+    play = jax.jit(bed.play)
+    rows, columns = beds.PLAN.shape
+    skill, slow = bed.start, np.zeros((rows, columns))
+    key_cell = next((i, j) for i in range(rows) for j in range(columns) if beds.PLAN[i, j] == "K")
+    table = {False: [0.01, 0.0, 0.01], True: [0.002, 0.02, 0.01]}
+
+    def learns(i, j):
+        return beds.PLAN[i, j] != "#" and (j < 3 or slow[key_cell] > 0.7)
+
+    def practise(goals, strategy):
+        nonlocal skill
+        region = regions.locate(bed.regions, jnp.asarray(goals[0], jnp.float32))
+        at = (region, jnp.array(strategy), jnp.asarray(goals, jnp.float32), jnp.array(False))
+        skill, seen = play(skill, *at, key=jax.random.key(0))
+        for goal, observed in zip(goals, seen, strict=True):
+            cell = tuple(int(x) for x in goal)
+            i, j = (0, 0) if strategy == 2 else cell
+            if learns(i, j):
+                spread = {(i, j): 1.0} | {(i + a, j + b): 0.25 for a, b in ((0, 1), (1, 0), (0, -1), (-1, 0))}
+                inside = {c: x for c, x in spread.items() if 0 <= c[0] < rows and 0 <= c[1] < columns and learns(*c)}
+                for c, share in inside.items():
+                    slow[c] += share * table[j >= 3][strategy] * (1 - slow[c])
+            np.testing.assert_allclose(observed, slow[cell], rtol=1e-3, atol=1e-5)
+
+    draw = lambda: rng.uniform([0, 0], [rows, columns], (5, 2))  # noqa: E731
+    for block in range(40):
+        practise(draw(), block % 3)
+    assert (slow[:, 3:] == 0).all() and slow[0, 0] > 0
+    for _ in range(40):
+        practise(np.tile(np.add(key_cell, 0.5), (5, 1)), 0)
+    for block in range(60):
+        practise(draw(), block % 3)
+    assert slow[:, 4:].max() > 0.05 and (slow[beds.PLAN == "#"] == 0).all()
+    np.testing.assert_allclose(skill, slow, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(bed.mastery(skill), slow.sum() / (beds.PLAN != "#").sum(), rtol=1e-3)
+
+
+def test_the_oracle_does_what_the_law_makes_best():
+    bed = beds.six_regions(noise=0.2)
+    course = jax.jit(lambda key: beds.run(bed, beds.oracle(bed), key=key))(jax.random.key(0))
+    assert course.mastery.mean() == pytest.approx(0.953, abs=0.002)
+    assert 5 * int(beds.until_mastered(course)) == pytest.approx(1260, abs=20)
+    assert (int(course.region[0]), int(course.strategy[0])) == (3, 2)
+    needed = [int(np.argmax(course.region == r)) for r in range(3)]
+    assert needed[0] < needed[1] < needed[2]
