@@ -57,7 +57,7 @@ def all_selectors(bed: Bed) -> Iterator[tuple[str, str, Selector]]:
         rule = selectors.fixed_frequency(sgim.Config(), space, bed.strategies, teacher=teacher, every=every)
         yield "fixed frequency (SGIM-D)", f"every {every}", rule
     yield "SGIM", "defaults", selectors.sgim(sgim.Config(), space, costs)
-    for sharpness, optimism in itertools.product((4.0, 8.0, 12.0), (0.003, 0.005, 0.01, 0.02)):
+    for sharpness, optimism in itertools.product((4.0, 8.0, 12.0), (0.005, 0.01, 0.015, 0.02)):
         config = sgim.Config(sharpness=sharpness, optimism=optimism)
         yield "SGIM, swept", f"sharpness {sharpness:g}, optimism {optimism}", selectors.sgim(config, space, costs)
     yield "SGIM, absolute progress", "forgetting 1", selectors.sgim(sgim.Config(forgetting=1.0), space, costs)
@@ -164,14 +164,14 @@ def draw(found: list[dict[str, Any]], blocks: int, path: Path) -> None:
     names = list(dict.fromkeys(row["bed"] for row in found))
     figure = Figure(figsize=(4.2 * len(names), 4), layout="constrained")
     for axis, bed in zip(figure.subplots(1, len(names), sharey=True, squeeze=False)[0], names, strict=True):
-        for row in best(found):
-            if row["bed"] == bed:
-                at = np.linspace(0, blocks * EPISODES, len(row["curve"]))
-                axis.plot(at, row["curve"], label=row["selector"], lw=2.5 if row["selector"] == "SGIM" else 1)
+        for number, row in enumerate(row for row in best(found) if row["bed"] == bed):
+            at = np.linspace(0, blocks * EPISODES, len(row["curve"]))
+            style = {"color": f"C{number % 10}", "ls": "-" if number < 10 else "--"}
+            axis.plot(at, row["curve"], label=row["selector"], lw=2.5 if row["selector"] == "SGIM" else 1, **style)
         axis.set(title=bed, xlabel="episodes")
         axis.grid(alpha=0.3)
     figure.axes[0].set(ylabel="mastery")
-    figure.axes[-1].legend(fontsize="small")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", fontsize="small")
     figure.savefig(path, dpi=110)
 
 

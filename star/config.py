@@ -288,7 +288,7 @@ class SelectionConfig(Section):
         0.001, gt=0, description="doubt about what a strategy adds grows by this in a block; it begins with 1"
     )
     optimism: float = Field(
-        0.005, ge=0, description="what the root of a doubt of 1 is worth (units of competence per block)"
+        0.01, ge=0, description="what the root of a doubt of 1 is worth at most (units of competence per block)"
     )
     forgetting: float = Field(
         0.0, ge=0, le=1, description="what lost competence is worth of an equal gain; 1 is absolute progress"
@@ -298,9 +298,7 @@ class SelectionConfig(Section):
     best_point: Literal["progress", "worst"] = Field(
         "progress", description="best point of a region: where competence grew most, or is lowest"
     )
-    sharpness: float = Field(
-        8.0, gt=0, description="choices are drawn in proportion to interest to this power; 2 for many at once"
-    )
+    sharpness: float = Field(12.0, gt=0, description="choices are drawn in proportion to interest to this power")
     focus: float = Field(0.1, gt=0, le=1, description="how near: half-width as a share of the region's width")
     min_side: Positive = Field(8, description="remembered goals on each side of a cut at least")
     min_width: float = Field(1e-3, gt=0, description="no region is cut narrower than this (units of goals)")
@@ -316,6 +314,12 @@ class SelectionConfig(Section):
         if 2 * self.per_block > self.window:
             raise ValueError(f"per_block {self.per_block} is more than half of window {self.window}")
         return self
+
+
+class EpochSelectionConfig(SelectionConfig):
+    """SGIM's choices where many environments make them from the same state: spread more widely."""
+
+    sharpness: float = Field(2.0, gt=0, description=SelectionConfig.model_fields["sharpness"].description)
 
 
 class TeacherConfig(Section):
@@ -355,7 +359,7 @@ class SgimConfig(Section):
         1.0, ge=0, description="weight of demonstrated actions in the loss of the Controller's actor"
     )
     imitation_batch: Positive = Field(256, description="demonstrated actions in each of its updates")
-    selection: SelectionConfig = SelectionConfig()
+    selection: EpochSelectionConfig = EpochSelectionConfig()
 
     @property
     def names(self) -> tuple[str, ...]:

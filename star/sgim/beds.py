@@ -198,7 +198,8 @@ def oracle(bed: Bed, *, episodes: int = 16) -> Selector:
             return once(goals[:, None]).mean()
 
         gains = jax.vmap(jax.vmap(gain, (None, 0)), (0, None))(jnp.arange(len(lower)), jnp.arange(bed.strategies))
-        return jnp.unravel_index(jnp.argmax(gains), gains.shape)
+        region, strategy = jnp.unravel_index(jnp.argmax(gains), gains.shape)
+        return region, strategy
 
     def update(latent: Any, region: Array, strategy: Array, goals: Array, competences: Array) -> Any:
         return bed.play(latent, region, strategy, goals, late, key=unused)[0]

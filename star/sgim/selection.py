@@ -2,7 +2,7 @@
 
     progress by strategy s      P_rs = what a block of episodes with s adds to the competence of region r
     doubt                       v_rs = how uncertain that is
-    interest                    I_rs = (max(P_rs, 0) + optimism sqrt(v_rs)) / cost_s
+    interest                    I_rs = (max(P_rs, 0) + min(optimism, P) sqrt(v_rs)) / cost_s,  P the largest of all P_rs
     choice                      region and strategy ~ I_rs ^ sharpness; a share is random
 
 A block is what one call of `update` is told: a few episodes of one learner in a row, or an epoch of many environments.
@@ -132,10 +132,13 @@ def mastered(state: SgimState) -> Float[Array, "R d"]:
 def interest(config: SelectionConfig, state: SgimState) -> Float[Array, "R S"]:
     """What each strategy adds to the competence of each region, if all goes well, over its cost; 0 if inactive.
 
-    Loss of competence is worth nothing, or with `forgetting` that share of a gain.
+    Loss of competence is worth nothing, or with `forgetting` that share of a gain. What is unknown is worth no more
+    than the best that is known, so that slow learning is not drowned by curiosity.
     """
-    worth = jnp.maximum(state.gains, -config.forgetting * state.gains) + config.optimism * jnp.sqrt(state.doubt)
-    return jnp.where(state.abstraction.active[:, None], worth / state.costs, 0.0)
+    active = state.abstraction.active[:, None]
+    known = jnp.maximum(state.gains, -config.forgetting * state.gains) * active
+    hope = jnp.minimum(config.optimism, jnp.maximum(known.max(), 1e-6)) * jnp.sqrt(state.doubt)
+    return jnp.where(active, (known + hope) / state.costs, 0.0)
 
 
 def probabilities(

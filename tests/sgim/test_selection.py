@@ -92,7 +92,8 @@ class Slow:
         return np.mean(last[-half:]) - np.mean(last[-2 * half : -half]) if half else 0.0
 
     def interest(self, r, s):
-        return (max(self.gains[r, s], 0) + self.config.optimism * self.doubt[r, s] ** 0.5) / COSTS[s]
+        hope = min(self.config.optimism, max(self.gains.max(), 1e-6))
+        return (max(self.gains[r, s], 0) + hope * self.doubt[r, s] ** 0.5) / COSTS[s]
 
     def probability(self, available, admissible):
         pairs = [(r, s) for r in np.flatnonzero(admissible[:4]) for s in np.flatnonzero(available)]
@@ -323,7 +324,15 @@ def test_lost_competence_is_worth_what_forgetting_says():
     state = state.replace(gains=jnp.broadcast_to(jnp.array([-0.3, 0.3]), (R, 2)))
     for forgetting, expected in ((0.0, 0.0), (0.5, 0.15), (1.0, 0.3)):
         config = sgim.Config(forgetting=forgetting, optimism=0.0)
-        np.testing.assert_allclose(sgim.interest(config, state)[0], [expected, 0.3])
+        np.testing.assert_allclose(sgim.interest(config, state)[0], [expected, 0.3], rtol=1e-6)
+
+
+def test_what_is_unknown_is_worth_no_more_than_the_best_that_is_known():
+    state = sgim.init(CONFIG, four_regions(), [1.0, 1.0])
+    for best in (0.001, 0.5):
+        known = state.replace(gains=state.gains.at[0, 0].set(best), doubt=state.doubt.at[0, 0].set(0.0))
+        interest = sgim.interest(CONFIG, known)
+        np.testing.assert_allclose([interest[0, 0], interest[1, 0]], [best, min(best, CONFIG.optimism)], rtol=1e-5)
 
 
 def test_what_was_not_tried_for_long_is_tried_again():

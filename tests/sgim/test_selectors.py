@@ -65,7 +65,7 @@ def test_ucb_takes_the_arm_of_the_largest_bound(settings):
     [
         selectors.exp3(R, S, rate=0.03),
         selectors.exp3(R, S, rate=0.03, share=0.01),
-        selectors.exp4(sgim.Config(optimism=1.0), SPACE, S, rate=0.03),
+        selectors.exp4(sgim.Config(), SPACE, S, rate=0.03),
     ],
     ids=["Exp3", "Exp3.S", "Exp4"],
 )
@@ -89,8 +89,8 @@ def test_fixed_frequency_asks_its_teacher_in_every_nth_block():
 
 
 def test_exp4_trusts_its_experts_as_in_a_loop():
-    """SGIM's optimism makes its own advice almost even; that of the strategies follows progress, the same for both."""
-    rule, config = selectors.exp4(sgim.Config(optimism=1e3), SPACE, S, rate=0.2), sgim.Config(optimism=1e3)
+    config = sgim.Config()
+    rule = selectors.exp4(config, SPACE, S, rate=0.2)
     update, probabilities = jax.jit(rule.update), jax.jit(sgim.probabilities)
     rng, state, weights, seen, last = np.random.default_rng(0), rule.state, np.zeros(2 + S), [], [None] * R
     for _ in range(60):
