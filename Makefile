@@ -2,7 +2,7 @@
 # Stable-Baselines3 are not skipped), and what pytest is given.
 PYTHON ?= python3
 TEST_EXTRAS ?= test
-PYTEST_ARGS ?= -n 2 --dist loadfile
+PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
 CONFIG ?= configs/point_maze.yaml
 
 VENV := .venv

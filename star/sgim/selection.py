@@ -115,14 +115,12 @@ def progress(config: SelectionConfig, state: SgimState) -> Float[Array, "R"]:
 
 def competence(state: SgimState) -> Float[Array, "R"]:
     """Mean of what is remembered of each region; 0 where that is nothing."""
-    newer, older = _halves(state)
-    return _mean(state.competences, newer | older)
+    return _mean(state.competences, _known(state))
 
 
 def mastered(state: SgimState) -> Float[Array, "R d"]:
     """The remembered goal of each region with the greatest competence, or its centre if none is remembered."""
-    newer, older = _halves(state)
-    known = newer | older
+    known = _known(state)
     best = jnp.argmax(jnp.where(known, state.competences, -jnp.inf), axis=-1)
     goal = jnp.take_along_axis(state.goals, best[:, None, None], axis=1)[:, 0]
     centre = (state.abstraction.lower + state.abstraction.upper) / 2
@@ -380,6 +378,11 @@ def _remember(
         competences=state.competences.at[cell].set(competences, mode="drop"),
         written=state.written + jnp.minimum(mine.sum(axis=0), config.per_block),
     )
+
+
+def _known(state: SgimState) -> Bool[Array, "R W"]:
+    """Which slots of each region's window have been written."""
+    return jnp.arange(state.competences.shape[1]) < state.written[:, None]
 
 
 def _newest_first(state: SgimState) -> tuple[Int[Array, "R W"], Bool[Array, "R W"]]:

@@ -8,9 +8,11 @@ from scipy import stats
 
 import star.state
 from star import abstraction as regions
-from star import commander, hierarchy, loading, ppo, td3
+from star import commander, hierarchy, loading, ppo, refinement, td3
+from star.abstraction import Cut
 from star.config import SgimConfig
 from star.loading import ConfigError
+from star.refinement import Split
 from star.replay import Imitation, Transition
 from star.sgim import selection, strategies
 from star.sgim.teachers import Demonstrations, nearest
@@ -108,8 +110,8 @@ def test_each_teacher_shows_what_is_nearest_and_only_to_those_who_ask():
 def test_own_decomposition_goes_by_way_of_what_is_mastered_best_in_a_region():
     config = settings(strategies=["autonomous", "decomposition"])
     state = strategies.init(config, four_regions())
-    competences = state.competences.at[1, :3].set(jnp.array([0.2, 0.9, 0.5]))
-    goals = state.goals.at[1, :3].set(jnp.array([[0.5, 2.5], [1.5, 3.5], [1.0, 3.0]]))
+    competences = state.competences.at[1, :3].set(jnp.array([0.9, 0.2, 0.5]))
+    goals = state.goals.at[1, :3].set(jnp.array([[1.5, 3.5], [0.5, 2.5], [1.0, 3.0]]))
     state = state.replace(competences=competences, goals=goals, written=state.written.at[1].set(3))
     lesson = lesson_of(config, state)[0]
     mine = np.asarray(lesson.choice.strategy) == 1
@@ -328,7 +330,7 @@ def test_what_does_not_fit_is_refused_in_one_line(values, told):
 
 @pytest.fixture(scope="module")
 def schooled(tiny, breaking_env):
-    """Twelve epochs of the tiny hierarchy with all that SGIM can do, states and metrics, and how often it compiled."""
+    """Three epochs of the tiny hierarchy with all that SGIM can do, states and metrics, and how often it compiled."""
     everything = {
         "sgim": {
             "goals": True,
@@ -351,7 +353,7 @@ def schooled(tiny, breaking_env):
     # With this key a region is cut, which is rare in so few epochs.
     state = jax.jit(lambda key: star.state.init(parsed.agent(), spec, key=key))(jax.random.key(22))
     states, metrics = [state], []
-    for _ in range(12):
+    for _ in range(3):
         state, more = epoch(state)
         states.append(state)
         metrics.append(more)
@@ -361,7 +363,6 @@ def schooled(tiny, breaking_env):
 def test_sgim_follows_the_agent_through_its_epochs(schooled):
     parsed, states, metrics, traces = schooled
     assert traces == 1
-    assert int(states[-1].abstraction.count) > int(states[0].abstraction.count)
     for state in states:
         jax.tree.map(np.testing.assert_array_equal, state.sgim.abstraction, state.abstraction)
     for more in metrics:
@@ -371,6 +372,31 @@ def test_sgim_follows_the_agent_through_its_epochs(schooled):
     assert float(states[-1].sgim.episodes.sum()) > 0
     remembered = selection.competence(states[-1].sgim)
     assert np.isfinite(remembered).all() and (remembered > 0).any()
+
+
+def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env, monkeypatch):
+    agent, spec = loading.parse({**tiny, "sgim": {"goals": True}}).agent(), Spec.of(breaking_env.env)
+    before = star.state.init(agent, spec, key=jax.random.key(0))
+    last = int(before.abstraction.count)
+    cuts = [Cut(jnp.int32(15), jnp.int32(0), jnp.float32(9.0)), Cut(jnp.int32(last), jnp.int32(1), jnp.float32(5.0))]
+    undone = Cut(jnp.int32(3), jnp.int32(0), jnp.float32(-2.0))
+    table = before.abstraction
+    for cut in cuts:
+        table, _ = regions.split(table, cut, min_width=0.01)
+    splits = [Split(jnp.array(True), cut, jnp.int32(last + i)) for i, cut in enumerate(cuts)]
+    splits.append(Split(jnp.array(False), undone, jnp.int32(last + 1)))
+    stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *splits)
+    monkeypatch.setattr(refinement, "refine", lambda *_, **__: (table, before.graph, stacked, {}))
+    goals = jnp.array([[5.0, 1.0], [12.0, 3.0], [12.0, 8.0]])  # below the first cut, below and above the second
+    known = before.sgim.replace(
+        goals=before.sgim.goals.at[15, :3].set(goals),
+        competences=before.sgim.competences.at[15, :3].set(jnp.array([0.1, 0.2, 0.3])),
+        written=before.sgim.written.at[15].set(3),
+    )
+    after, _ = hierarchy.refine(agent, spec, before.replace(sgim=known), None, key=jax.random.key(0))
+    jax.tree.map(np.testing.assert_array_equal, after.sgim.abstraction, table)
+    assert after.sgim.written[jnp.array([15, last, last + 1])].tolist() == [1, 1, 1]
+    np.testing.assert_allclose(selection.competence(after.sgim)[jnp.array([15, last, last + 1])], [0.1, 0.2, 0.3])
 
 
 def test_everything_that_learns_stays_finite(schooled):
