@@ -100,9 +100,10 @@ def sgim_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], wall
     last = [row for row in regions if row["seed"] == regions[0]["seed"]][-1] if regions else None
     figure = Figure(figsize=(10.4 if last else 5.8, 4.4), layout="constrained")
     axes = figure.subplots(1, 2 if last else 1, squeeze=False)[0]
-    axes[0].stackplot(steps, [curve(prefix + name) for name in names], labels=names, alpha=0.7)
-    axes[0].plot(steps, curve("sgim/competence"), "k--", label="competence")
-    axes[0].set(xlabel="env steps", ylabel="share of episodes", ylim=(0, 1))
+    millions = np.asarray(steps) / 1e6
+    axes[0].stackplot(millions, [curve(prefix + name) for name in names], labels=names, alpha=0.7)
+    axes[0].plot(millions, curve("sgim/competence"), "k--", label="competence")
+    axes[0].set(xlabel="million env steps", ylabel="share of episodes", ylim=(0, 1))
     axes[0].legend(loc="upper left", fontsize="small")
     if last:
         draw_regions(axes[1], last, walls, by="drawn")
