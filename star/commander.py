@@ -253,13 +253,8 @@ def measure(config: CommanderConfig, state: CommanderState, allowed: Successors,
 
 
 def _q_learning(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> CommanderState:
-    cell = (batch.region, batch.goal_region, batch.target)
     error = _td_error(config, state, allowed, batch)
-    weight = batch.weight * (1 - batch.practised)
-    visits = jnp.zeros_like(state.q).at[cell].add(weight)
-    total = jnp.zeros_like(state.q).at[cell].add(weight * error)
-    alpha = 1 - (1 - config.learning_rate) ** visits
-    return state.replace(q=state.q + alpha * total / jnp.maximum(visits, 1.0))
+    return _step(config, state, batch, error, weight=batch.weight * (1 - batch.practised))
 
 
 def _follow_teacher(
@@ -273,12 +268,23 @@ def _follow_teacher(
     row = state.q[batch.region, batch.goal_region]
     chosen = jax.nn.one_hot(batch.target, row.shape[-1])
     lacking = jnp.max(row + margin * (1 - chosen), axis=-1) - jnp.sum(row * chosen, axis=-1)
+    return _step(config, state, batch, lacking, weight=batch.weight * shown)
+
+
+def _step(
+    config: CommanderConfig,
+    state: CommanderState,
+    batch: Decision,
+    error: Float[Array, "N"],
+    *,
+    weight: Float[Array, "N"],
+) -> CommanderState:
+    """Q after as many updates of each visited cell as its `weight` makes, all towards their mean `error`."""
     cell = (batch.region, batch.goal_region, batch.target)
-    shown = batch.weight * shown
-    times = jnp.zeros_like(state.q).at[cell].add(shown)
-    total = jnp.zeros_like(state.q).at[cell].add(shown * lacking)
-    alpha = 1 - (1 - config.learning_rate) ** times
-    return state.replace(q=state.q + alpha * total / jnp.maximum(times, 1.0))
+    visits = jnp.zeros_like(state.q).at[cell].add(weight)
+    total = jnp.zeros_like(state.q).at[cell].add(weight * error)
+    alpha = 1 - (1 - config.learning_rate) ** visits
+    return state.replace(q=state.q + alpha * total / jnp.maximum(visits, 1.0))
 
 
 def _td_error(

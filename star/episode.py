@@ -167,7 +167,8 @@ def command(
     """The Commander's decision, for the streams whose clock is 0."""
     obs = streams.env.obs
     locate = jax.vmap(partial(regions.locate, state.abstraction))
-    region, goal_region = locate(spec.abstract(obs)), locate(spec.goal_point(obs))
+    aim = spec.goal_point(obs)
+    region, goal_region = locate(spec.abstract(obs)), locate(aim)
     target, practice, lesson = goal_region, streams.practice, streams.lesson
     if config.commander.enabled:
         act_key, practice_key = jax.random.split(key)
@@ -186,7 +187,7 @@ def command(
         if config.commander.hold:
             there = (streams.env.metrics["success"] > 0) & (practice < 0)
             target = jnp.where(there, goal_region, target)
-    aim, around_point = spec.goal_point(obs), (target == goal_region) & (practice < 0)
+    around_point = (target == goal_region) & (practice < 0)
     if config.commander.enabled and lesson is not None:
         lesson, waypoint, guided = strategies.impose(config.sgim, lesson, spec.abstract(obs))
         target = jnp.where(guided, locate(waypoint), target)

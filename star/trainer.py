@@ -252,9 +252,8 @@ def _loop(
         if saved != done:
             checkpoints.save(env_steps, state, program.config, success=_or_zero(success))
     if program.config.commander.enabled and not (regions and regions[-1]["env_steps"] == env_steps):
-        regions.extend(
-            report.region_rows(state, seeds, env_steps=env_steps, sgim=program.config.sgim)
-        )  # stopped between evaluations
+        # stopped between evaluations
+        regions.extend(report.region_rows(state, seeds, env_steps=env_steps, sgim=program.config.sgim))
     report.summary_figure(run_dir / "figures" / "summary.png", regions=regions, rows=rows, walls=program.walls)
     if regions:
         report.growth_figure(run_dir / "figures" / "growth.png", regions=regions, walls=program.walls)

@@ -109,7 +109,9 @@ def impose(
 
 def babbles(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
     """Which environments are to follow random subgoals."""
-    return _pursued(config, lesson, "babbling")
+    if "babbling" not in config.strategies:
+        return jnp.zeros(lesson.taught.shape, bool)
+    return lesson.taught & (lesson.choice.strategy == config.strategies.index("babbling"))
 
 
 def guided(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
@@ -246,12 +248,6 @@ def _budgets(config: SgimConfig) -> Float[Array, "S"]:
     return jnp.asarray(
         [jnp.inf] * len(config.strategies) + [teacher.max_queries or jnp.inf for teacher in config.teachers]
     )
-
-
-def _pursued(config: SgimConfig, lesson: Lesson, strategy: str) -> Bool[Array, "B"]:
-    if strategy not in config.strategies:
-        return jnp.zeros(lesson.taught.shape, bool)
-    return lesson.taught & (lesson.choice.strategy == config.names.index(strategy))
 
 
 def _locate(abstraction: Abstraction, points: Float[Array, "N d"]) -> Int[Array, "N"]:
