@@ -2,8 +2,8 @@
 
     python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--one-by-one] [--out FOLDER] [-- SETTINGS]
 
-TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents or configs/ablations laid
-over it; by default all agents. SETTINGS are passed on to `star train`. For each name the seeds are trained side by side
+TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents, configs/ablations or
+configs/sgim laid over it; by default all agents. SETTINGS are passed on to `star train`. For each name the seeds are trained side by side
 in one program, or with --one-by-one one after another, which is how wall-clock times to a success are meant to be
 taken. Into results/TASK, or results/TASK/one_by_one, go
 
@@ -38,6 +38,7 @@ from star.evaluation import bootstrap
 from star.metrics import JsonLines
 
 ROOT = Path(__file__).parents[1]
+LAYERS = ("agents", "ablations", "sgim")
 AGENTS = ("star", "hiro", "hrac", "gara", "flat", "flat_td3")
 LEVEL = 0.9  # of success_any, for the time to it
 CURVE = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
@@ -49,11 +50,11 @@ def layer(name: str) -> list[str]:
     """Arguments of `star train` that turn the task's config into that of the agent `name`; SystemExit if unknown."""
     if name == "star":
         return []
-    for folder in ("agents", "ablations"):
+    for folder in LAYERS:
         path = Path("configs") / folder / f"{name}.yaml"
         if (ROOT / path).is_file():
             return ["--with", str(path)]
-    known = sorted(path.stem for folder in ("agents", "ablations") for path in (ROOT / "configs" / folder).glob("*"))
+    known = sorted(path.stem for folder in LAYERS for path in (ROOT / "configs" / folder).glob("*.yaml"))
     raise SystemExit(f"error: {name}: no such agent; known are star, {', '.join(known)}")
 
 
