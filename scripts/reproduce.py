@@ -1,17 +1,18 @@
 """Train and evaluate the agents of a results table, and draw their curves.
 
-    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--one-by-one] [--out FOLDER] [-- SETTINGS]
+    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--one-by-one] [--level 0.9] [--out FOLDER] [-- SETTINGS]
 
 TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents, configs/ablations or
 configs/sgim laid over it; by default all agents. SETTINGS are passed on to `star train`. For each name the seeds are trained side by side
 in one program, or with --one-by-one one after another, which is how wall-clock times to a success are meant to be
 taken. Into results/TASK, or results/TASK/one_by_one, go
 
-    NAME.json     every seed's success on `--episodes` greedy episodes on test goals; env steps to success_any .9 (null:
-                  never), seconds of training to it, and seconds since the start of the run, with compilation and
-                  evaluations; of every program its seeds, command, commit, device and versions
+    NAME.json     every seed's success on `--episodes` greedy episodes on test goals; env steps to success_any `--level`
+                  (null: never), seconds of training to it, and seconds since the start of the run, with compilation
+                  and evaluations; of every program its seeds, command, commit, device and versions
     curves.jsonl  all evaluations during training
-    curves.png    success_any over env steps and over wall-clock: mean over seeds and their range
+    curves.png    success_any over env steps and over wall-clock: mean over seeds and their range; where teachers may be
+                  asked also the share of episodes in which they are
     table.md      means over seeds and interquartile means with 95 % bootstrap intervals
 
 Seeds that a JSON already holds are not trained again. Runs are kept under `--runs`; one that was interrupted goes on,
@@ -40,7 +41,6 @@ from star.metrics import JsonLines
 ROOT = Path(__file__).parents[1]
 LAYERS = ("agents", "ablations", "sgim")
 AGENTS = ("star", "hiro", "hrac", "gara", "flat", "flat_td3")
-LEVEL = 0.9  # of success_any, for the time to it
 CURVE = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
 STAR = (sys.executable, "-m", "star.cli")
 _DEVICE = "import jax; d = jax.devices()[0]; print(d.device_kind if d.platform == 'gpu' else 'CPU')"
@@ -76,13 +76,19 @@ def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace,
     }
 
 
-def summarise(task: str, name: str, old: dict[str, Any], measured: dict[str, Any]) -> tuple[dict[str, Any], list]:
+def summarise(
+    task: str, name: str, old: dict[str, Any], measured: dict[str, Any], *, level: float
+) -> tuple[dict[str, Any], list]:
     """What goes into an agent's JSON, the seeds of the `old` one included, and the new evaluations during training."""
     rows = measured["rows"]
-    curve = [{"name": name} | {k: row[k] for k in CURVE if k in row} for row in rows if "eval/success_any" in row]
+    curve = [
+        {"name": name} | {k: v for k, v in row.items() if k in CURVE or k.startswith("sgim/")}
+        for row in rows
+        if "eval/success_any" in row
+    ]
     speed = float(np.median([row["env_steps_per_s"] for row in rows]))  # of the seeds of a program together
     for seed in measured["evaluated"]:
-        first = next((p for p in curve if p["seed"] == seed["seed"] and p["eval/success_any"] >= LEVEL), None)
+        first = next((p for p in curve if p["seed"] == seed["seed"] and p["eval/success_any"] >= level), None)
         seed |= {
             "env_steps_to_level": first and first["env_steps"],
             "training_seconds_to_level": first and round(first["env_steps"] * len(measured["evaluated"]) / speed, 1),
@@ -92,6 +98,7 @@ def summarise(task: str, name: str, old: dict[str, Any], measured: dict[str, Any
         "task": task,
         "name": name,
         "env_steps_per_seed": rows[-1]["env_steps"],
+        "level": level,
         "seeds": [*old.get("seeds", []), *measured["evaluated"]],
         "runs": [*old.get("runs", []), measured["run"] | {"env_steps_per_s": speed}],
     }, curve
@@ -132,14 +139,15 @@ def interquartile_mean(values: np.ndarray) -> float:
 
 def table(reports: list[dict[str, Any]]) -> str:
     """A Markdown table of the agents."""
+    level = reports[0].get("level", 0.9)
     lines = [
         "| agent | seeds | env steps per seed | success_any | success_final | interquartile mean of success_final "
-        f"| median env steps to success_any {LEVEL:g} | seconds of training to it | seconds since the start |",
+        f"| median env steps to success_any {level:g} | seconds of training to it | seconds since the start |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for report in reports:
         seeds = report["seeds"]
-        cells = [report["name"], str(len(seeds)), f"{report['env_steps_per_seed'] / 1e6:.1f} M"]
+        cells = [report["name"], str(len(seeds)), _steps(report["env_steps_per_seed"])]
         for key, statistic in (
             ("success_any", np.mean),
             ("success_final", np.mean),
@@ -147,7 +155,7 @@ def table(reports: list[dict[str, Any]]) -> str:
         ):
             cells.append("{:.2f} [{:.2f}, {:.2f}]".format(*bootstrap([seed[key] for seed in seeds], statistic)))
         for key, form in (
-            ("env_steps_to_level", lambda x: f"{x / 1e6:.1f} M"),
+            ("env_steps_to_level", _steps),
             ("training_seconds_to_level", "{:.0f} s".format),
             ("seconds_to_level", "{:.0f} s".format),
         ):
@@ -157,10 +165,17 @@ def table(reports: list[dict[str, Any]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _steps(number: float) -> str:
+    """Env steps for people."""
+    return f"{number / 1e6:.1f} M" if number >= 1e6 else f"{number / 1e3:.0f} k"
+
+
 def draw(curves: list[dict[str, Any]], path: Path) -> None:
     """success_any over env steps and over wall-clock, mean and range over seeds."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    axes = figure.subplots(1, 2, sharey=True)
+    asked = {name: _asked(curves, name) for name in dict.fromkeys(point["name"] for point in curves)}
+    panels = 3 if any(asked.values()) else 2
+    figure = Figure(figsize=(5 * panels, 4), layout="constrained")
+    axes = figure.subplots(1, panels, sharey=True)
     for name in dict.fromkeys(point["name"] for point in curves):
         mine = [point for point in curves if point["name"] == name]
         steps = sorted({point["env_steps"] for point in mine})
@@ -169,15 +184,30 @@ def draw(curves: list[dict[str, Any]], path: Path) -> None:
             [f([p["eval/success_any"] for p in points]) for points in at] for f in (np.min, np.mean, np.max)
         )
         seconds = [np.mean([p["wall_s"] for p in points]) for points in at]
-        for axis, x in zip(axes, (np.asarray(steps) / 1e6, seconds), strict=True):
+        if asked[name]:
+            axes[2].plot(*zip(*asked[name], strict=True), label=name, color=f"C{list(asked).index(name)}")
+        for axis, x in zip(axes[:2], (np.asarray(steps) / 1e6, seconds), strict=True):
             (line,) = axis.plot(x, mean, label=name)
             axis.fill_between(x, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
     axes[0].set(xlabel="million env steps per seed", ylabel="success_any on test goals", ylim=(-0.02, 1.02))
     axes[1].set(xlabel="seconds, compilation included")
     axes[1].legend()
+    if panels > 2:
+        axes[2].set(xlabel="million env steps per seed", ylabel="share of episodes with a teacher")
+        axes[2].yaxis.set_tick_params(labelleft=True)
     for axis in axes:
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=120)
+
+
+def _asked(curves: list[dict[str, Any]], name: str) -> list[tuple[float, float]]:
+    """(million env steps, share of the taught episodes in which a teacher was asked), mean over seeds."""
+    shares: dict[int, list[float]] = {}
+    for point in curves:
+        teachers = [key.removeprefix("sgim/queries_") for key in point if key.startswith("sgim/queries_")]
+        if point["name"] == name and teachers:
+            shares.setdefault(point["env_steps"], []).append(sum(point[f"sgim/share_{t}"] for t in teachers))
+    return [(step / 1e6, float(np.mean(values))) for step, values in sorted(shares.items())]
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -189,6 +219,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("names", nargs="*", default=AGENTS)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--level", type=float, default=0.9, help="of success_any, for the time to it")
     parser.add_argument("--one-by-one", action="store_true")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--commit", help="what to record where there is no git")
@@ -211,7 +242,7 @@ def main(arguments: list[str] | None = None) -> None:
         missing = sorted(set(range(options.seeds)) - {seed["seed"] for seed in report.get("seeds", [])})
         for seeds in groups(missing, one_by_one=options.one_by_one):
             measured = measure(options.task, name, seeds, options, settings)
-            report, curve = summarise(options.task, name, report, measured)
+            report, curve = summarise(options.task, name, report, measured, level=options.level)
             kept = [point for point in record.read() if point["name"] != name or point["seed"] not in seeds] + curve
             record.path.write_text("".join(json.dumps(point) + "\n" for point in kept), encoding="utf-8")
             path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")

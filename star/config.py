@@ -351,12 +351,19 @@ class SgimConfig(Section):
     ask: Literal["progress", "evenly"] = Field(
         "progress", description="which strategy: by progress over cost, or each as often, as in SGIM-D"
     )
+    unaided: bool = Field(
+        True, description="ask progress: who would ask goes alone instead, as often as the region is mastered"
+    )
     exploration: bool = Field(False, description="the Commander's random targets are drawn by progress")
     refinement: bool = Field(False, description="examine first what is half mastered and makes no progress")
     waypoint_radius: float = Field(2.0, gt=0, description="m: so near a waypoint is passed")
+    detours: bool = Field(True, description="what a teacher only goes around to is not believed to be reached directly")
+    subgoals: bool = Field(
+        True, description="on the way to a teacher's waypoint the Tutor is shown subgoals straight ahead, to imitate"
+    )
     margin: float = Field(0.0, ge=0, description="learner q: what a teacher's choice is to be better by than others")
     imitation: float = Field(
-        1.0, ge=0, description="weight of demonstrated actions in the loss of the Controller's actor"
+        1.0, ge=0, description="weight of what is demonstrated in the losses of the Tutor's and Controller's actors"
     )
     imitation_batch: Positive = Field(256, description="demonstrated actions in each of its updates")
     selection: EpochSelectionConfig = EpochSelectionConfig()
@@ -365,6 +372,11 @@ class SgimConfig(Section):
     def names(self) -> tuple[str, ...]:
         """All strategies: those alone, then the teachers."""
         return (*self.strategies, *(teacher.name for teacher in self.teachers))
+
+    @property
+    def routes(self) -> tuple[str, ...]:
+        """The teachers that show routes."""
+        return tuple(teacher.name for teacher in self.teachers if teacher.kind == "decomposition")
 
     @property
     def enabled(self) -> bool:
@@ -432,8 +444,7 @@ class Config(Section):
     def _strategies_need_levels(self) -> Self:
         if "babbling" in self.sgim.strategies and not self.tutor.enabled:
             raise ValueError("sgim.strategies: babbling needs tutor.enabled, whose subgoals it replaces")
-        routes = [teacher.name for teacher in self.sgim.teachers if teacher.kind == "decomposition"]
-        if not self.commander.enabled and ("decomposition" in self.sgim.strategies or routes):
+        if not self.commander.enabled and ("decomposition" in self.sgim.strategies or self.sgim.routes):
             raise ValueError("sgim: decomposition needs commander.enabled, whose targets it sets")
         return self
 

@@ -233,6 +233,9 @@ def choose_subgoal(
         return jnp.concatenate([streams.box.lower - position, streams.box.upper - position], axis=-1), None
     seen = tutor.observe(config.tutor, spec.state(obs), position, streams.box)
     action = learner.act(config.tutor, state.tutor, seen, deterministic=deterministic, key=key)
+    if streams.lesson is not None and config.sgim.subgoals:
+        straight = jnp.clip(spec.towards(obs, streams.box.centre) / spec.scale, -1.0, 1.0)
+        action = jnp.where(strategies.guided(config.sgim, streams.lesson)[:, None], straight, action)
     if streams.lesson is not None and "babbling" in config.sgim.strategies:
         anything = jax.random.uniform(jax.random.fold_in(key, 1), action.shape, minval=-1.0)
         action = jnp.where(strategies.babbles(config.sgim, streams.lesson)[:, None], anything, action)

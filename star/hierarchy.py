@@ -31,7 +31,7 @@ from star.commander import CommanderState, Decision, Successors
 from star.config import AgentConfig
 from star.episode import Episode, Steps, Streams
 from star.forward_model import Outcome
-from star.replay import Imitation, Penalty, Transition
+from star.replay import Imitation, Penalty, Transition, flatten
 from star.sgim import selection, strategies
 from star.sgim.selection import SgimState
 from star.sgim.strategies import Lesson
@@ -50,7 +50,8 @@ def epoch(
     key, reset_key, scan_key, end_key = jax.random.split(state.key, 4)
     streams = episode.start(spec, env, practice=commander.practice(config.commander), key=reset_key)
     if config.sgim.enabled:
-        streams = _begin_lesson(config, spec, env, state, teachers, streams, key=jax.random.fold_in(reset_key, 1))
+        lesson_key = jax.random.fold_in(reset_key, 1)
+        state, streams = _begin_lesson(config, spec, env, state, teachers, streams, key=lesson_key)
     segments = spec.episode_length // config.tutor.period
     blocks = (segments // config.tutor.unroll, config.tutor.unroll)
     (state, streams), (outcomes, metrics, counts) = jax.lax.scan(
@@ -84,7 +85,7 @@ def _begin_lesson(
     streams: Streams,
     *,
     key: Array,
-) -> Streams:
+) -> tuple[TrainState, Streams]:
     """Let SGIM choose goals, strategies and teachers of the environments that do not practise."""
     assert state.sgim is not None
     obs = streams.env.obs
@@ -99,7 +100,10 @@ def _begin_lesson(
     )
     env_state = episode.pursue(spec, env, streams.env, lesson, jnp.ones_like(lesson.taught))
     lesson = strategies.begin(lesson, env_state.metrics["distance"], radius=spec.success_radius)
-    return streams.replace(env=env_state, lesson=lesson)
+    if config.sgim.detours and config.sgim.routes:
+        paths, weight = strategies.ways(config.sgim, lesson, spec.abstract(obs))
+        state = state.replace(graph=refinement.tell(state.graph, state.abstraction, paths, weight))
+    return state, streams.replace(env=env_state, lesson=lesson)
 
 
 def _end_lesson(config: AgentConfig, spec: Spec, state: TrainState, streams: Streams) -> tuple[TrainState, Metrics]:
@@ -144,6 +148,15 @@ def _imitation(
     return jax.tree.map(lambda *parts: jnp.concatenate(parts), *batches) if batches else None
 
 
+def _shown_subgoals(config: AgentConfig, decisions: Transition, shown: Float[Array, "T B"] | None) -> Imitation | None:
+    """The subgoals of the Tutor that teachers have set."""
+    if shown is None or not (config.sgim.subgoals and config.sgim.routes):
+        return None
+    weight = config.sgim.imitation * shown / jnp.maximum(shown.mean(), 1e-6)
+    obs, action, weight = flatten((decisions.obs, decisions.action, weight))
+    return Imitation(obs=obs, action=action, weight=weight)
+
+
 def _block(
     config: AgentConfig,
     spec: Spec,
@@ -169,6 +182,7 @@ def _block(
             decisions,
             relabel=relabel,
             penalty=_penalty(config, spec, state) if config.tutor.adjacency.enabled else None,
+            imitation=_shown_subgoals(config, decisions, outcomes[0].shown),
             key=update_key,
         )
         state, metrics = state.replace(tutor=learnt), metrics | _prefix("tutor", more)
@@ -240,7 +254,7 @@ def _command_better(
         return learnt
 
     def plan(learnt: CommanderState) -> CommanderState:
-        believed = regions.adjacent(state.abstraction)
+        believed = regions.adjacent(state.abstraction) & (state.graph.told >= 0)
         if config.commander.successors != "all":
             believed = state.graph.reaches | (believed & ~state.graph.misses)
         return commander.plan(config.commander, learnt, allowed, believed=believed)
@@ -373,6 +387,8 @@ def _tutor_transition(
     weight = jnp.ones_like(terminated)
     if streams.lesson is not None:
         weight *= ~strategies.babbles(config.sgim, streams.lesson)
+        if config.sgim.subgoals:  # somebody else's, to be imitated
+            weight *= ~strategies.guided(config.sgim, streams.lesson)
     return Transition(
         obs=observe(spec.state(began), spec.abstract(began), streams.box),
         action=action,

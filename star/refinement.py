@@ -46,6 +46,8 @@ class Graph(struct.PyTreeNode):
     transitions: Float[Array, "R R"]
     error: Float[Array, "R R"]
     stable: Bool[Array, "R R"]
+    told: Int[Array, "R R"]
+    """By teachers: 1 where they go from one into the other, -1 where they only go by way of a third, else 0."""
 
     @property
     def reaches(self) -> Bool[Array, "R R"]:
@@ -84,7 +86,26 @@ def init(*, capacity: int) -> Graph:
         transitions=jnp.zeros(square),
         error=jnp.full(square, jnp.inf, jnp.float32),
         stable=jnp.zeros(square, bool),
+        told=jnp.zeros(square, jnp.int32),
     )
+
+
+def tell(
+    graph: Graph, abstraction: Abstraction, paths: Float[Array, "N T d"], weight: Float[Array, "N"] | float = 1.0
+) -> Graph:
+    """Take in the ways that teachers go, given as points close to one another; those of weight 0 count for nothing."""
+    weight = jnp.broadcast_to(weight, paths.shape[:1])
+    region = jax.vmap(jax.vmap(partial(regions.locate, abstraction)))(paths)
+    order = jnp.cumsum(jnp.diff(region, axis=1, prepend=region[:, :1]) != 0, axis=1)  # counts the regions entered
+    later = order[:, None, :] - order[:, :, None]
+    inside = jax.nn.one_hot(region, abstraction.capacity)
+
+    def pairs(chosen: Bool[Array, "N T T"]) -> Bool[Array, "R R"]:
+        return jnp.einsum("n,nti,ntu,nuj->ij", weight, inside, chosen.astype(jnp.float32), inside) > 0
+
+    directly, around = pairs(later == 1), pairs(later > 1)
+    told = jnp.where(around & (graph.told < 1), -1, graph.told)
+    return graph.replace(told=jnp.where(directly, 1, told))
 
 
 def observe(
@@ -267,6 +288,7 @@ def on_split(graph: Graph, split: Split) -> Graph:
     parts = parts.replace(
         verdict=jnp.where(changed[None, :], UNKNOWN, parts.verdict),
         transitions=jnp.where(changed[:, None] | changed[None, :], 0.0, parts.transitions),
+        told=jnp.where(changed[:, None] | changed[None, :], jnp.minimum(parts.told, 0), parts.told),
     )
     return regions.where(split.done, parts, graph)
 

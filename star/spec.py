@@ -75,6 +75,15 @@ class Spec:
         ahead = self.heading * jnp.stack([jnp.cos(facing), jnp.sin(facing)], axis=-1)
         return jnp.concatenate([self.abstract(obs), ahead], axis=-1)
 
+    def towards(self, obs: Float[Array, "*batch obs"], point: Float[Array, "*batch d"]) -> Float[Array, "*batch p"]:
+        """From the pose to that of having come straight to the abstract `point`, looking ahead."""
+        way = point - self.abstract(obs)
+        if not self.heading:
+            return way
+        flat = way[..., :2]
+        ahead = self.heading * flat / jnp.maximum(jnp.linalg.norm(flat, axis=-1, keepdims=True), 1e-6)
+        return jnp.concatenate([way, ahead - self.pose(obs)[..., way.shape[-1] :]], axis=-1)
+
     def goal_point(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch d"]:
         """g* as an abstract point; abstract dimensions that g* leaves open are those of the state."""
         columns = [

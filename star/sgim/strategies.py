@@ -83,6 +83,10 @@ def assign(
     if config.ask == "evenly":
         drawn = jax.random.categorical(turn_key, jnp.where(present, 0.0, -jnp.inf), shape=taught.shape)
         choice = choice.replace(strategy=drawn)
+    elif config.unaided:
+        alone = jax.random.uniform(turn_key, taught.shape) < selection.competence(state)[choice.region]
+        asks = choice.strategy >= len(config.strategies)
+        choice = choice.replace(strategy=jnp.where(asks & alone, 0, choice.strategy))
     choice = _within_budget(config, state, choice, taught)
     return _prepare(config, state, teachers, choice, start=start, taught=taught, key=via_key)
 
@@ -117,6 +121,20 @@ def babbles(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
 def guided(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
     """Where a teacher chooses the Commander's targets now."""
     return (lesson.leg < lesson.waypoints.shape[1]) & (lesson.choice.strategy >= len(config.strategies))
+
+
+def ways(
+    config: SgimConfig, lesson: Lesson, start: Float[Array, "B d"], *, most: int = 64, parts: int = 16
+) -> tuple[Float[Array, "N T d"], Float[Array, "N"]]:
+    """The ways that teachers lead from `start`, at most so many, and which of them are some (1, else 0).
+
+    They are given as points, `parts` on each straight leg.
+    """
+    weight, which = jax.lax.top_k(guided(config, lesson).astype(jnp.float32), min(most, len(start)))
+    corners = jnp.concatenate([start[which, None], lesson.waypoints[which]], axis=1)
+    share = jnp.linspace(0.0, 1.0, parts)[:, None]
+    points = corners[:, :-1, None] + share * (corners[:, 1:] - corners[:, :-1])[:, :, None]
+    return points.reshape(len(which), -1, start.shape[-1]), weight
 
 
 def begin(lesson: Lesson, distance: Float[Array, "B"], *, radius: float) -> Lesson:
