@@ -1,11 +1,11 @@
 """Train and evaluate the agents of a results table, and draw their curves.
 
-    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--one-by-one] [--level 0.9] [--out FOLDER] [-- SETTINGS]
+    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--level 0.9] [--one-by-one] [--out FOLDER] [-- SETTINGS]
 
 TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents, configs/ablations or
-configs/sgim laid over it; by default all agents. SETTINGS are passed on to `star train`. For each name the seeds are trained side by side
-in one program, or with --one-by-one one after another, which is how wall-clock times to a success are meant to be
-taken. Into results/TASK, or results/TASK/one_by_one, go
+configs/sgim laid over it; by default all agents. SETTINGS are passed on to `star train`. For each name the seeds are
+trained side by side in one program, or with --one-by-one one after another, which is how wall-clock times to a success
+are meant to be taken. Into results/TASK, or results/TASK/one_by_one, go
 
     NAME.json     every seed's success on `--episodes` greedy episodes on test goals; env steps to success_any `--level`
                   (null: never), seconds of training to it, and seconds since the start of the run, with compilation
@@ -167,7 +167,7 @@ def table(reports: list[dict[str, Any]]) -> str:
 
 def _steps(number: float) -> str:
     """Env steps for people."""
-    return f"{number / 1e6:.1f} M" if number >= 1e6 else f"{number / 1e3:.0f} k"
+    return f"{number / 1e6:.1f} M" if number >= 1e6 else f"{number / 1e3:.3g} k"
 
 
 def draw(curves: list[dict[str, Any]], path: Path) -> None:
@@ -239,6 +239,8 @@ def main(arguments: list[str] | None = None) -> None:
     for name in options.names:
         path = out / f"{name}.json"
         report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        if report and report.get("level", 0.9) != options.level:
+            raise SystemExit(f"error: --level {options.level:g}: {path} was made with {report.get('level', 0.9):g}")
         missing = sorted(set(range(options.seeds)) - {seed["seed"] for seed in report.get("seeds", [])})
         for seeds in groups(missing, one_by_one=options.one_by_one):
             measured = measure(options.task, name, seeds, options, settings)

@@ -1,5 +1,7 @@
 """When a pair is examined, where a region is cut, and what is remembered of it."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -39,6 +41,7 @@ def random_graph(seed):
         transitions=jnp.asarray(rng.integers(0, 21, (R, R)), jnp.float32),
         error=jnp.asarray(rng.random((R, R)), jnp.float32),
         stable=jnp.asarray(rng.random((R, R)) < 0.5),
+        told=jnp.asarray(rng.integers(-1, 2, (R, R)), jnp.int32),
     )
 
 
@@ -220,8 +223,44 @@ def test_after_a_split_starts_inherit_verdicts_and_targets_begin_anew():
             assert float(after.transitions[i, j]) == (0 if changed else float(graph.transitions[i, j]))
             assert float(after.error[i, j]) == float(graph.error[old])
             assert bool(after.stable[i, j]) == bool(graph.stable[old])
+            assert int(after.told[i, j]) == (min(int(graph.told[old]), 0) if changed else int(graph.told[old]))
     unchanged = refinement.on_split(graph, split_of(False))
     jax.tree.map(np.testing.assert_array_equal, graph, unchanged)
+
+
+def told_by_loop(before, visited):
+    """What `refinement.tell` makes of lists of regions, one for each way."""
+    runs = [[a for a, b in zip(way, [None, *way], strict=False) if a != b] for way in visited]
+    direct = {pair for run in runs for pair in itertools.pairwise(run)}
+    around = {(run[i], run[j]) for run in runs for i in range(len(run)) for j in range(i + 2, len(run))}
+    expected = np.array(before)
+    for i, j in itertools.product(range(R), range(R)):
+        if (i, j) in around and expected[i, j] < 1:
+            expected[i, j] = -1
+        if (i, j) in direct:
+            expected[i, j] = 1
+    return expected
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_teachers_tell_where_they_go_directly_and_where_only_around(seed):
+    rng, table = np.random.default_rng(seed), grid()
+    before = random_graph(seed).replace(told=jnp.asarray(rng.integers(-1, 2, (R, R)) * (seed > 0), jnp.int32))
+    paths = jnp.asarray(rng.uniform(-4, 20, (3, 4, 2)), jnp.float32)
+    weight = jnp.array([1.0, 0.0, 1.0])
+    after = jax.jit(refinement.tell)(before, table, paths, weight)
+    visited = [[int(regions.locate(table, point)) for point in path] for path in paths[weight > 0]]
+    np.testing.assert_array_equal(after.told, told_by_loop(before.told, visited))
+    assert seed > 0 or (np.asarray(after.told) != 0).any()
+
+
+def test_a_way_around_a_wall_says_that_there_is_none_through_it():
+    """Regions 0 to 3 are lower left, upper left, lower right, upper right, and the way goes by the right."""
+    way = jnp.array([[[0.0, 0.0], [16.0, 0.0], [16.0, 16.0], [0.0, 16.0]]])
+    told = refinement.tell(refinement.init(capacity=R), grid(), way).told
+    first, *_, last = (int(regions.locate(grid(), point)) for point in way[0])
+    assert int(told[first, last]) == -1 and int(told[last, first]) == 0
+    assert int((told == 1).sum()) == 3
 
 
 def test_a_region_of_which_a_part_reaches_is_cut_where_that_part_begins(refine, moving):

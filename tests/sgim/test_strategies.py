@@ -8,7 +8,7 @@ from scipy import stats
 
 import star.state
 from star import abstraction as regions
-from star import commander, hierarchy, loading, ppo, refinement, td3
+from star import commander, episode, hierarchy, loading, ppo, refinement, td3
 from star.abstraction import Cut
 from star.config import SgimConfig
 from star.loading import ConfigError
@@ -17,6 +17,7 @@ from star.replay import Imitation, Transition
 from star.sgim import selection, strategies
 from star.sgim.teachers import Demonstrations, nearest
 from star.spec import Spec
+from star.tutor import Box
 
 B, L = 64, 3
 GUIDE = {"name": "guide", "kind": "decomposition"}
@@ -148,6 +149,41 @@ def test_asking_evenly_pays_no_heed_to_progress():
         for seed in range(5)
     )
     assert stats.chisquare(counts).pvalue > 1e-3
+
+
+def test_who_has_mastered_a_region_asks_nobody_there():
+    mastery = jnp.array([0.0, 0.25, 1.0, 0.75])
+    asked = {}
+    for unaided in (False, True):
+        config = settings(teachers=[GUIDE, AIMS], unaided=unaided)
+        state = strategies.init(config, four_regions())
+        known = state.competences.at[:4, 0].set(mastery)
+        state = state.replace(competences=known, written=state.written.at[:4].set(1))
+        asked[unaided] = np.zeros(4)
+        for seed in range(12):
+            lesson, _, goal, _ = lesson_of(config, state, seed=seed)
+            region = [located(np.asarray(g)) for g in goal]
+            asked[unaided] += np.bincount(region, np.asarray(lesson.choice.strategy) > 0, minlength=4)
+    share = asked[True] / asked[False]
+    assert share[0] == 1 and share[2] == 0
+    assert abs(share[1] - 0.75) < 0.15 and abs(share[3] - 0.25) < 0.15
+
+
+def test_ways_are_points_on_the_straight_legs_of_those_who_are_led():
+    config = settings(teachers=[GUIDE, AIMS])
+    lesson, start, _, _ = lesson_of(config)
+    led = np.flatnonzero(np.asarray(lesson.choice.strategy) == 1)
+    paths, weight = strategies.ways(config, lesson, start, most=len(led) + 2, parts=5)
+    assert paths.shape == (len(led) + 2, lesson.waypoints.shape[1] * 5, 2) and weight.tolist() == [1.0] * len(led) + [
+        0.0,
+        0.0,
+    ]
+    for path, b in zip(np.asarray(paths), led, strict=False):
+        corners = [start[b], *lesson.waypoints[b]]
+        expected = [np.linspace(a, b, 5) for a, b in zip(corners, corners[1:], strict=False)]
+        np.testing.assert_allclose(path, np.concatenate(expected), atol=1e-5)
+    fewer, _ = strategies.ways(config, lesson, start, most=2, parts=5)
+    np.testing.assert_array_equal(fewer, paths[:2])
 
 
 def test_waypoints_are_passed_where_the_agent_is_near():
@@ -397,6 +433,66 @@ def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env, monkey
     jax.tree.map(np.testing.assert_array_equal, after.sgim.abstraction, table)
     assert after.sgim.written[jnp.array([15, last, last + 1])].tolist() == [1, 1, 1]
     np.testing.assert_allclose(selection.competence(after.sgim)[jnp.array([15, last, last + 1])], [0.1, 0.2, 0.3])
+
+
+def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_tutor_imitates_them(
+    tiny, breaking_env, turning
+):
+    agent = loading.parse({**tiny, "sgim": {"teachers": [GUIDE], "imitation": 2.0}}).agent()
+    lesson, _, _, _ = lesson_of(agent.sgim)
+    n = breaking_env.num_envs
+    lesson = jax.tree.map(lambda x: x[:n], lesson)
+    led = np.asarray(strategies.guided(agent.sgim, lesson))
+    assert led.any() and not led.all()
+    point = jnp.asarray(np.random.default_rng(0).uniform(-4, 20, (n, 2)), jnp.float32)
+
+    def chosen(key, lesson):
+        state = star.state.init(agent, turning, key=key)
+        streams = episode.start(turning, breaking_env, key=key)
+        streams = streams.replace(lesson=lesson, box=Box(lower=point - 1, upper=point + 1))
+        began = streams.env.obs
+        subgoal, action = episode.choose_subgoal(agent, turning, state, streams, deterministic=False, key=key)
+        after, steps = episode.rollout(
+            agent, turning, breaking_env, state, streams, subgoal, deterministic=False, key=key
+        )
+        return began, subgoal, hierarchy._tutor_transition(agent, turning, after, began, action, steps)
+
+    obs, subgoal, decisions = jax.jit(chosen)(jax.random.key(0), lesson)
+    alone = jax.jit(chosen)(jax.random.key(0), None)[1]
+    np.testing.assert_array_equal(subgoal[~led], alone[~led])
+    pose, scale = np.asarray(turning.pose(obs)), np.asarray(turning.scale)
+    for b in np.flatnonzero(led):
+        way = np.asarray(point[b]) - pose[b, :2]
+        straight = np.concatenate([way, turning.heading * way / np.linalg.norm(way) - pose[b, 2:]])
+        np.testing.assert_allclose(subgoal[b], np.clip(straight, -scale, scale), atol=1e-4)
+
+    np.testing.assert_array_equal(decisions.weight, ~led)  # what is shown is no experience of the Tutor's own
+    stacked = jax.tree.map(lambda x: jnp.stack([x, x]), decisions)
+    imitation = hierarchy._shown_subgoals(agent, stacked, jnp.stack([led, led * 0.0]))
+    np.testing.assert_array_equal(imitation.action, np.concatenate([decisions.action, decisions.action]))
+    assert float(imitation.weight.mean()) == pytest.approx(2) and imitation.weight.shape == (2 * n,)
+    np.testing.assert_array_equal(np.asarray(imitation.weight) > 0, np.concatenate([led, led & False]))
+    assert hierarchy._shown_subgoals(agent, stacked, None) is None
+
+
+def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, breaking_env):
+    agent, spec = loading.parse({**tiny, "sgim": {"teachers": [GUIDE]}}).agent(), Spec.of(breaking_env.env)
+    state = star.state.init(agent, spec, key=jax.random.key(0))
+    i, j = map(
+        int,
+        np.argwhere(np.asarray(regions.adjacent(state.abstraction)) & ~np.eye(len(state.graph.told), dtype=bool))[0],
+    )
+    nothing = jnp.zeros(3, jnp.int32)
+    decision = commander.Decision(*[nothing] * 3, *[jnp.zeros(3)] * 1, nothing, *[jnp.zeros(3)] * 3)
+    allowed = episode.successors(agent, state)
+    last = agent.commander.period // agent.tutor.period - 1
+
+    def value(told):
+        graph = state.graph.replace(told=state.graph.told.at[i, j].set(told))
+        known = state.replace(graph=graph)
+        return hierarchy._command_better(agent, spec, known, allowed, decision, jnp.int32(last)).model.reach[i, j, j]
+
+    assert float(value(-1)) < float(value(0)) == float(value(1))
 
 
 def test_everything_that_learns_stays_finite(schooled):
