@@ -149,7 +149,7 @@ def _imitation(
 
 
 def _shown_subgoals(config: AgentConfig, decisions: Transition, shown: Float[Array, "T B"] | None) -> Imitation | None:
-    """The subgoals of the Tutor that teachers have set."""
+    """The subgoals that teachers have set; their weights make the loss a mean over them alone."""
     if shown is None or not (config.sgim.subgoals and config.sgim.routes):
         return None
     weight = config.sgim.imitation * shown / jnp.maximum(shown.mean(), 1e-6)
