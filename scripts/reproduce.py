@@ -11,17 +11,18 @@ are meant to be taken. Into results/TASK, or results/TASK/one_by_one, go
                   (null: never), seconds of training to it, and seconds since the start of the run, with compilation
                   and evaluations; of every program its seeds, command, commit, device and versions
     curves.jsonl  all evaluations during training
-    curves.png    success_any over env steps and over wall-clock: mean over seeds and their range; where teachers may be
-                  asked also the share of episodes in which they are
+    curves.png    success_any over env steps and over wall-clock: mean over seeds, and their range if there are at most
+                  five agents; where teachers may be asked also the share of episodes in which they are
     table.md      means over seeds and interquartile means with 95 % bootstrap intervals
 
-Seeds that a JSON already holds are not trained again. Runs are kept under `--runs`; one that was interrupted goes on,
-so empty that folder when code or settings have changed.
+Seeds that a JSON already holds are not trained again. Runs are kept under `--runs`, those with other SETTINGS apart.
+One that was interrupted goes on, so empty that folder when code or configs have changed.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import platform
 import shlex
@@ -60,7 +61,8 @@ def layer(name: str) -> list[str]:
 
 def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace, settings: list[str]) -> dict[str, Any]:
     """Train and evaluate the consecutive `seeds` of one agent in one program: metrics, evaluation, how it was run."""
-    run = options.runs / task / "-".join([name, *map(str, seeds)])
+    other = [hashlib.sha256(shlex.join(settings).encode()).hexdigest()[:8]] if settings else []
+    run = options.runs / task / "-".join([name, *map(str, seeds), *other])
     chosen = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), *settings]
     train = ["train", f"configs/{task}.yaml", *layer(name), *chosen]
     if (run / "checkpoints").exists():  # interrupted, or done
@@ -171,12 +173,14 @@ def _steps(number: float) -> str:
 
 
 def draw(curves: list[dict[str, Any]], path: Path) -> None:
-    """success_any over env steps and over wall-clock, mean and range over seeds."""
-    asked = {name: _asked(curves, name) for name in dict.fromkeys(point["name"] for point in curves)}
+    """success_any over env steps and over wall-clock, and how often teachers are asked."""
+    names = list(dict.fromkeys(point["name"] for point in curves))
+    unit, word = (1e6, "million") if max(point["env_steps"] for point in curves) >= 1e6 else (1e3, "thousand")
+    asked = {name: _asked(curves, name) for name in names}
     panels = 3 if any(asked.values()) else 2
     figure = Figure(figsize=(5 * panels, 4), layout="constrained")
     axes = figure.subplots(1, panels, sharey=True)
-    for name in dict.fromkeys(point["name"] for point in curves):
+    for number, name in enumerate(names):
         mine = [point for point in curves if point["name"] == name]
         steps = sorted({point["env_steps"] for point in mine})
         at = [[p for p in mine if p["env_steps"] == step] for step in steps]
@@ -184,30 +188,31 @@ def draw(curves: list[dict[str, Any]], path: Path) -> None:
             [f([p["eval/success_any"] for p in points]) for points in at] for f in (np.min, np.mean, np.max)
         )
         seconds = [np.mean([p["wall_s"] for p in points]) for points in at]
+        for axis, x in zip(axes[:2], (np.asarray(steps) / unit, seconds), strict=True):
+            axis.plot(x, mean, label=name, color=f"C{number}")
+            if len(names) <= 5:
+                axis.fill_between(x, low, high, color=f"C{number}", alpha=0.15, linewidth=0)
         if asked[name]:
-            axes[2].plot(*zip(*asked[name], strict=True), label=name, color=f"C{list(asked).index(name)}")
-        for axis, x in zip(axes[:2], (np.asarray(steps) / 1e6, seconds), strict=True):
-            (line,) = axis.plot(x, mean, label=name)
-            axis.fill_between(x, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
-    axes[0].set(xlabel="million env steps per seed", ylabel="success_any on test goals", ylim=(-0.02, 1.02))
+            axes[2].plot([step / unit for step in asked[name]], list(asked[name].values()), color=f"C{number}")
+    axes[0].set(xlabel=f"{word} env steps per seed", ylabel="success_any on test goals", ylim=(-0.02, 1.02))
     axes[1].set(xlabel="seconds, compilation included")
     axes[1].legend()
     if panels > 2:
-        axes[2].set(xlabel="million env steps per seed", ylabel="share of episodes with a teacher")
+        axes[2].set(xlabel=f"{word} env steps per seed", ylabel="share of episodes with a teacher")
         axes[2].yaxis.set_tick_params(labelleft=True)
     for axis in axes:
         axis.grid(alpha=0.3)
     figure.savefig(path, dpi=120)
 
 
-def _asked(curves: list[dict[str, Any]], name: str) -> list[tuple[float, float]]:
-    """(million env steps, share of the taught episodes in which a teacher was asked), mean over seeds."""
+def _asked(curves: list[dict[str, Any]], name: str) -> dict[int, float]:
+    """Share of the taught episodes in which a teacher was asked, mean over seeds, by env steps."""
     shares: dict[int, list[float]] = {}
     for point in curves:
         teachers = [key.removeprefix("sgim/queries_") for key in point if key.startswith("sgim/queries_")]
         if point["name"] == name and teachers:
             shares.setdefault(point["env_steps"], []).append(sum(point[f"sgim/share_{t}"] for t in teachers))
-    return [(step / 1e6, float(np.mean(values))) for step, values in sorted(shares.items())]
+    return {step: float(np.mean(values)) for step, values in sorted(shares.items())}
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -136,6 +136,8 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
         ([2, 3, 4], "c0ffee"),
     ]
     assert {seed["training_seconds_to_level"] for seed in kept["seeds"]} == {5.0}
+    script.main(["point_maze", "star", "--seeds", "1", "--out", str(tmp_path / "c"), *common, "--", "--seed", "7"])
+    assert trained[-1] == [0] and len(list((tmp_path / "runs" / "point_maze").glob("star-0-*"))) == 2
     assert "| star | 5 | 0.5 k | 1.00 [1.00, 1.00] | 0.50 [" in (tmp_path / "a" / "table.md").read_text()
     (tmp_path / "a" / "star.json").unlink()
     (tmp_path / "a" / "notes.json").write_text("not a report", encoding="utf-8")
@@ -157,8 +159,16 @@ def test_curves_are_drawn(tmp_path):
         for seed in (0, 1)
         for step in (100, 200)
     ]
-    load("reproduce").draw(points, tmp_path / "curves.png")
+    script = load("reproduce")
+    script.draw(points, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 1000
+    for number, point in enumerate(points):
+        if point["name"] == "star":
+            point |= {"sgim/queries_guide": 3.0, "sgim/share_guide": number / 10, "sgim/share_autonomous": 0.5}
+    assert script._asked(points, "flat") == {}
+    assert script._asked(points, "star") == pytest.approx({100: (0 + 0.2) / 2, 200: (0.1 + 0.3) / 2})
+    script.draw(points, tmp_path / "asked.png")
+    assert (tmp_path / "asked.png").stat().st_size > (tmp_path / "curves.png").stat().st_size
 
 
 def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
