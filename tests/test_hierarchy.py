@@ -281,8 +281,8 @@ def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tin
     assert section in str(caught.value) and "batch_size" in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("headed", [False, True])
-def test_the_published_learners_run_a_whole_epoch(breaking_env, turning, tiny, headed):
+def test_the_published_learners_run_a_whole_epoch_with_a_heading_too(breaking_env, turning, tiny):
+    """Without one they do in `test_trainer.py`."""
     td3 = {"hidden": [8], "batch_size": 8, "buffer_size": 64, "min_transitions": 8, "updates_per_rollout": 2}
     values = {
         **tiny,
@@ -290,7 +290,7 @@ def test_the_published_learners_run_a_whole_epoch(breaking_env, turning, tiny, h
         "tutor": {"period": L, "unroll": 2, "learner": "td3", "off_policy_correction": True, "td3": td3},
         "controller": {"learner": "td3", "td3": td3},
     }
-    published = Epoch(breaking_env, values, turning if headed else None)
+    published = Epoch(breaking_env, values, turning)
     start = published.init(jax.random.key(0))
     end, metrics = published.one(published.config.agent(), start)
     assert int(end.tutor.updates) == 10 and int(end.controller.updates) == 20
