@@ -60,7 +60,7 @@ def lesson_of(config, state=None, *, taught=None, seed=0, teachers=None):
     teachers = [demonstrations(i, length=i + 1) for i in range(len(config.teachers))] if teachers is None else teachers
     key = jax.random.key(seed)
     return (
-        strategies.assign(config, state, teachers, start=start, goal=goal, taught=taught, key=key),
+        assign(config, state, teachers, start=start, goal=goal, taught=taught, key=key),
         start,
         goal,
         state,
