@@ -42,6 +42,7 @@ from star.metrics import JsonLines
 ROOT = Path(__file__).parents[1]
 LAYERS = ("agents", "ablations", "sgim")
 AGENTS = ("star", "hiro", "hrac", "gara", "flat", "flat_td3")
+LEVEL = 0.9  # of success_any, for the time to it, unless said otherwise
 CURVE = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
 STAR = (sys.executable, "-m", "star.cli")
 _DEVICE = "import jax; d = jax.devices()[0]; print(d.device_kind if d.platform == 'gpu' else 'CPU')"
@@ -141,7 +142,7 @@ def interquartile_mean(values: np.ndarray) -> float:
 
 def table(reports: list[dict[str, Any]]) -> str:
     """A Markdown table of the agents."""
-    level = reports[0].get("level", 0.9)
+    level = reports[0].get("level", LEVEL)
     lines = [
         "| agent | seeds | env steps per seed | success_any | success_final | interquartile mean of success_final "
         f"| median env steps to success_any {level:g} | seconds of training to it | seconds since the start |",
@@ -224,7 +225,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("names", nargs="*", default=AGENTS)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=200)
-    parser.add_argument("--level", type=float, default=0.9, help="of success_any, for the time to it")
+    parser.add_argument("--level", type=float, default=LEVEL, help="of success_any, for the time to it")
     parser.add_argument("--one-by-one", action="store_true")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--commit", help="what to record where there is no git")
@@ -244,8 +245,9 @@ def main(arguments: list[str] | None = None) -> None:
     for name in options.names:
         path = out / f"{name}.json"
         report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        if report and report.get("level", 0.9) != options.level:
-            raise SystemExit(f"error: --level {options.level:g}: {path} was made with {report.get('level', 0.9):g}")
+        level = report.get("level", LEVEL) if report else options.level
+        if level != options.level:
+            raise SystemExit(f"error: --level {options.level:g}: {path} was made with {level:g}")
         missing = sorted(set(range(options.seeds)) - {seed["seed"] for seed in report.get("seeds", [])})
         for seeds in groups(missing, one_by_one=options.one_by_one):
             measured = measure(options.task, name, seeds, options, settings)

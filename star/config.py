@@ -379,6 +379,11 @@ class SgimConfig(Section):
         return tuple(teacher.name for teacher in self.teachers if teacher.kind == "decomposition")
 
     @property
+    def shows_subgoals(self) -> bool:
+        """Whether there is a teacher who sets the Tutor's subgoals."""
+        return self.subgoals and bool(self.routes)
+
+    @property
     def enabled(self) -> bool:
         """Whether anything is left to intrinsic motivation."""
         return self.goals or self.exploration or self.refinement or self.names != ("autonomous",)

@@ -233,7 +233,7 @@ def choose_subgoal(
         return jnp.concatenate([streams.box.lower - position, streams.box.upper - position], axis=-1), None
     seen = tutor.observe(config.tutor, spec.state(obs), position, streams.box)
     action = learner.act(config.tutor, state.tutor, seen, deterministic=deterministic, key=key)
-    if streams.lesson is not None and config.sgim.subgoals:
+    if streams.lesson is not None and config.sgim.shows_subgoals:
         straight = jnp.clip(spec.towards(obs, streams.box.centre) / spec.scale, -1.0, 1.0)
         action = jnp.where(strategies.guided(config.sgim, streams.lesson)[:, None], straight, action)
     if streams.lesson is not None and "babbling" in config.sgim.strategies:

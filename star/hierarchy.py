@@ -150,7 +150,7 @@ def _imitation(
 
 def _shown_subgoals(config: AgentConfig, decisions: Transition, shown: Float[Array, "T B"] | None) -> Imitation | None:
     """The subgoals that teachers have set; their weights make the loss a mean over them alone."""
-    if shown is None or not (config.sgim.subgoals and config.sgim.routes):
+    if shown is None or not config.sgim.shows_subgoals:
         return None
     weight = config.sgim.imitation * shown / jnp.maximum(shown.mean(), 1e-6)
     obs, action, weight = flatten((decisions.obs, decisions.action, weight))
@@ -387,7 +387,7 @@ def _tutor_transition(
     weight = jnp.ones_like(terminated)
     if streams.lesson is not None:
         weight *= ~strategies.babbles(config.sgim, streams.lesson)
-        if config.sgim.subgoals:  # somebody else's, to be imitated
+        if config.sgim.shows_subgoals:  # somebody else's, to be imitated
             weight *= ~strategies.guided(config.sgim, streams.lesson)
     return Transition(
         obs=observe(spec.state(began), spec.abstract(began), streams.box),
