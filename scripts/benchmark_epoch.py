@@ -14,7 +14,6 @@ import platform
 import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ import jax
 import jax.numpy as jnp
 
 import envs
-from star import cli, hierarchy, trainer
+from star import cli, hierarchy, refinement, trainer
 from star import forward_model as models
 from star.loading import load
 
@@ -52,11 +51,12 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
     jax.block_until_ready(state)
     epoch_s = (time.perf_counter() - began) / epochs
 
-    refine = jax.jit(jax.vmap(partial(hierarchy.refine, agent)))
     fresh = jax.tree.map(
         lambda x: x[:, 0, : min(x.shape[2], program.config.trainer.num_envs * 16)], state.forward_model.ring.experience
     )
+    goals = refinement.Goals.of(fresh, jnp.ones_like(fresh.weight), radius=program.spec.success_radius)
     keys = jax.random.split(jax.random.key(0), len(program.seeds))
+    refine = jax.jit(jax.vmap(lambda s, g, k: hierarchy.refine(agent, program.spec, s, g, key=k)))
     train = jax.jit(jax.vmap(lambda s, f, k: models.train(agent.forward_model, s, f, key=k)))
     return {
         "task": config.env.name,
@@ -69,7 +69,7 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
         "first_epoch_s": compile_s,
         "env_steps_per_s": steps / epoch_s,
         "physics_env_steps_per_s": _physics_speed(program, len(program.seeds)),
-        "refinement_share": _seconds(refine, state) / epoch_s,
+        "refinement_share": _seconds(refine, state, goals, keys) / epoch_s,
         "forward_model_share": _seconds(train, state.forward_model, fresh, keys) / epoch_s,
     }
 

@@ -55,6 +55,13 @@ def test_the_benchmark_measures_both_loops():
     assert row["bare"] > 0 and row["full"] > 0 and len(row["ratios"]) == 2
 
 
+def test_the_benchmark_of_an_epoch_measures_its_parts(run):
+    small = {"trainer.num_seeds": 1, "refinement.depth": 1, "refinement.pairs_per_epoch": 1, "tutor.ppo.passes": 1}
+    row = load("benchmark_epoch").benchmark(run / "config.yaml", 1, small)
+    assert row["env_steps_per_s"] == pytest.approx(4 * 40 / row["epoch_s"]) and row["physics_env_steps_per_s"] > 0
+    assert 0 < row["refinement_share"] and 0 < row["forward_model_share"]
+
+
 def report(name, finals, *, to_level):
     seeds = [
         {
