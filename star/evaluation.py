@@ -54,7 +54,7 @@ def bootstrap(values: Sequence[float], statistic: Callable[..., Any]) -> tuple[f
 def mean_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(mean, low, high), each [T], of the rows of `values` [n, T], with 95 % percentile bootstrap intervals over rows.
 
-    A single row is its own interval; where a row is NaN, so are all three.
+    A single row is its own interval; where a value is NaN, so are all three.
     """
     n = len(values)
     mean = values.mean(axis=0)

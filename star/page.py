@@ -34,15 +34,15 @@ MAX_POINTS = 300  # of a curve
 MAX_BOXES = 24_000  # regions of all runs in all frames together
 MAX_FILM = 1_500_000  # bytes of a film in the page
 
+Row = Mapping[str, Any]
+Kinds = Mapping[str, type | tuple[type, ...]]
+
 _MARK = '<meta name="generator" content="star report">'
 _SMALL_FILM = ("--every", "5", "--fps", "10", "--height", "240")  # about 1 MB for an episode of 500 env steps
-Kinds = Mapping[str, type | tuple[type, ...]]
 _NUMBER = (int, float)
 _METRICS: Kinds = {"seed": int, "env_steps": int, "wall_s": _NUMBER, "env_steps_per_s": _NUMBER}
 _REGIONS: Kinds = {"seed": int, "env_steps": int, "lower": list, "upper": list, "chosen": list}
 _PROVENANCE: Kinds = {"env_steps": int, "time": str, "device": str, "python": str, "versions": dict}
-
-Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ def write(runs: Mapping[Path, Config], out: Path) -> str:
     Raises:
       ConfigError: in one line, if a run or `out` cannot be used; nothing is written then.
     """
+    trainer.select_device("cpu")  # a GPU may be busy with one of the runs
     try:
         found = [read(path, config, name=name) for (path, config), name in zip(runs.items(), names(runs), strict=True)]
         page = html(content(found))
@@ -99,7 +100,8 @@ def read(run_dir: Path, config: Config, *, name: str) -> Run:
       ConfigError: in one line, if there is no complete epoch yet, or a line is not what a run writes.
     """
     journal = Journal.of(run_dir)
-    epochs = _by_step(_checked(journal.metrics, _METRICS), config.trainer.num_seeds)
+    seeds = config.trainer.num_seeds
+    epochs = _by_step(_checked(journal.metrics, _METRICS), seeds)
     if not epochs:
         raise ConfigError(f"{run_dir}: its metrics.jsonl holds no complete epoch, so there is nothing to show yet")
     return Run(
@@ -107,7 +109,7 @@ def read(run_dir: Path, config: Config, *, name: str) -> Run:
         name=name,
         config=config,
         epochs=epochs,
-        regions=_checked(journal.regions, _REGIONS),
+        regions=[row for rows in _by_step(_checked(journal.regions, _REGIONS), seeds) for row in rows],
         starts=_checked(journal.provenance, _PROVENANCE),
     )
 
@@ -118,14 +120,16 @@ def _checked(lines: JsonLines, kinds: Kinds) -> list[Row]:
     for number, row in enumerate(rows, 1):
         for key, kind in kinds.items():
             if not isinstance(row.get(key), kind):
-                raise ConfigError(f"{lines.path}: line {number}: {key} is {_worded(row.get(key))[:60]}")
+                raise ConfigError(
+                    f"{lines.path}: line {number}: {key} is {_worded(row.get(key))[:60]}, which no run writes"
+                )
         if len({len(row[key]) for key, kind in kinds.items() if kind is list}) > 1:
             raise ConfigError(f"{lines.path}: line {number}: its lists differ in length")
     return list(rows)
 
 
 def _by_step(rows: Sequence[Row], seeds: int) -> list[list[Row]]:
-    """The rows of each epoch that all `seeds` have written; of the last one some may be missing."""
+    """The rows of each moment that all `seeds` have written; of the last one some may be missing."""
     found: dict[int, list[Row]] = {}
     for row in rows:
         found.setdefault(row["env_steps"], []).append(row)
@@ -232,7 +236,7 @@ def growth(run: Run, *, most: int = MAX_BOXES) -> dict[str, Any]:
     """The abstraction of every seed as it grew, over the walls, at as many moments as hold `most` regions together.
 
     `boxes` are corners [x, y, .., x, y, ..] that `frames` name by index, so that a region that stays takes little
-    room. `chosen` and `visited` are shares in %, other tables are as in `regions.jsonl`.
+    room. `chosen`, `visited` and `drawn` are shares in %, other tables are as in `regions.jsonl`.
     """
     config = run.config.model_copy(update={"env": run.config.env.model_copy(update={"engine": "auto"})})
     env = trainer.make_env(config, "test")
@@ -267,7 +271,7 @@ def _frame(row: Row, boxes: dict[tuple[float | None, ...], int]) -> dict[str, An
     frame["box"] = [boxes.setdefault(box, len(boxes)) for box in corners]
     for key in ("chosen", "visited", "drawn"):
         if key in row:
-            frame[key] = np.round(100 * np.asarray(row[key]) / max(sum(row[key]), 1e-9), 2).tolist()
+            frame[key] = _short(100 * np.asarray(row[key]) / max(sum(row[key]), 1e-9))
     return frame | {key: _short(row[key]) for key in ("value", "competence") if key in row}
 
 

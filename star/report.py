@@ -39,7 +39,7 @@ def region_rows(
     are pairs of indices: the edges of the graph, and what was shown unreachable. With SGIM there are its `competence`
     in each region, and `drawn`, the share of its choices that fall there.
     """
-    tables = jax.vmap(partial(_tables, config, jax.numpy.asarray(goal)))(state)
+    tables = _tables(config, jax.numpy.asarray(goal), state)
     verdicts = {"reaches": state.graph.reaches, "misses": state.graph.misses}
     found, pairs, count = jax.device_get((tables, verdicts, state.abstraction.count))
 
@@ -55,8 +55,13 @@ def region_rows(
     ]
 
 
-def _tables(config: AgentConfig, goal: Array, state: TrainState) -> dict[str, Array]:
-    """What is known of each region of one seed, leading axis [R]."""
+@jax.jit
+def _tables(config: AgentConfig, goal: Array, states: TrainState) -> dict[str, Array]:
+    """What is known of each region of every seed, leading axes [seeds, R]."""
+    return jax.vmap(partial(_table, config, goal))(states)
+
+
+def _table(config: AgentConfig, goal: Array, state: TrainState) -> dict[str, Array]:
     goal_region = locate(state.abstraction, goal)
     value, target = commander.towards(state.commander, episode.successors(config, state), goal_region)
     tables = {

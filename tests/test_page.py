@@ -115,6 +115,12 @@ def test_of_a_run_that_goes_on_only_what_is_complete_is_shown(make):
     assert (facts["env_steps"], facts["total_env_steps"], facts["wall_s"]) == (300, 400, 6.0)
 
 
+def test_regions_that_only_some_seeds_have_written_yet_are_left_out(make):
+    rows = [{"seed": seed, "env_steps": n} | strip(1) for n, seed in ((200, 0), (200, 1), (400, 0))]
+    assert [row["env_steps"] for row in read(make("a", regions=rows)).regions] == [200, 200]
+    assert page.content([read(make("b", regions=rows[:1]))])["runs"][0]["map"] is None
+
+
 def test_before_the_first_evaluation_there_is_a_report_without_success(make):
     shown = page.content([read(make(rows=metrics(1, (0, 1)), regions=[]))])["runs"][0]
     assert (shown["facts"]["success_final"], shown["map"]) == (None, None)
