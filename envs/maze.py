@@ -161,7 +161,7 @@ class MazeEnv(Env):
         body_rng, goal_rng, start_rng, noise_rng = jax.random.split(rng, 4)
         steps = jnp.zeros((), jnp.int32)
         data = self._body.init(body_rng, sample(self._starts, start_rng))
-        goal = sample(self._goals, goal_rng)
+        goal = self.draw_goal(goal_rng)
         obs = jnp.concatenate([self._body.observe(data, steps), goal])
         noise = noise_rng if jnp.issubdtype(noise_rng.dtype, jnp.uint32) else jax.random.key_data(noise_rng)
         zero = jnp.zeros(())
@@ -173,6 +173,10 @@ class MazeEnv(Env):
             metrics=self._metrics(obs) | {"non_finite": zero, "overflow": zero, "flipped": zero},
             info={"steps": steps, "truncation": zero, "goal": goal},
         )
+
+    def draw_goal(self, rng: jax.Array) -> jax.Array:
+        """A desired goal [k], as an episode may have."""
+        return sample(self._goals, rng)
 
     def with_goal(self, state: State, goal: jax.Array) -> State:
         """`state`, at the start of an episode, with another desired goal [k]."""

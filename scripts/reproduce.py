@@ -24,11 +24,9 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
-import platform
 import shlex
 import subprocess
 import sys
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +35,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from star.evaluation import bootstrap
-from star.metrics import JsonLines
+from star.metrics import Journal, JsonLines
 
 ROOT = Path(__file__).parents[1]
 LAYERS = ("agents", "ablations", "sgim")
@@ -45,7 +43,6 @@ AGENTS = ("star", "hiro", "hrac", "gara", "flat", "flat_td3")
 LEVEL = 0.9  # of success_any, for the time to it, unless said otherwise
 CURVE = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
 STAR = (sys.executable, "-m", "star.cli")
-_DEVICE = "import jax; d = jax.devices()[0]; print(d.device_kind if d.platform == 'gpu' else 'CPU')"
 
 
 def layer(name: str) -> list[str]:
@@ -75,7 +72,7 @@ def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace,
     return {
         "rows": JsonLines(run / "metrics.jsonl").read(),
         "evaluated": json.loads(report.splitlines()[-1])["seeds"],
-        "run": {"seeds": seeds, "command": shlex.join(["star", *train])} | provenance(options.commit),
+        "run": {"seeds": seeds, "command": shlex.join(["star", *train])} | provenance(run, options.commit),
     }
 
 
@@ -118,21 +115,10 @@ def groups(missing: list[int], *, one_by_one: bool) -> list[list[int]]:
     return found
 
 
-def provenance(commit: str | None) -> dict[str, Any]:
-    """Commit (if not given that of this checkout, with a + if it was changed), device and versions."""
-    git = ["git", "-C", str(ROOT)]
-    if commit is None:
-        commit = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
-        changes = [*git, "status", "--porcelain", "star", "envs", "configs"]
-        commit += "+" * bool(subprocess.run(changes, capture_output=True).stdout)
-    device = subprocess.run([sys.executable, "-c", _DEVICE], capture_output=True, text=True).stdout.strip()
-    names = ("jax", "mujoco", "mujoco-mjx", "brax")
-    return {
-        "commit": commit,
-        "device": device,
-        "python": platform.python_version(),
-        "versions": {name: metadata.version(name) for name in names},
-    }
+def provenance(run: Path, commit: str | None) -> dict[str, Any]:
+    """Commit (the one given, else that which the run noted), device, Python and versions of the last start of `run`."""
+    noted = [row | ({"commit": commit} if commit else {}) for row in Journal.of(run).provenance.read()]
+    return {key: noted[-1][key] for key in ("commit", "device", "python", "versions")}
 
 
 def interquartile_mean(values: np.ndarray) -> float:

@@ -27,6 +27,7 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star render point_maze --out maze.png         a picture of a task
   star render --run runs/NAME --out film.html   an episode of a trained agent
   star record runs/NAME --out demos.npz         what a trained agent can show another
+  star report runs/A runs/B --out report.html   curves, regions and settings of runs, as one page
   star envs                                     the tasks
   star settings [PREFIX]                        every setting, its default and its meaning
 """
@@ -38,6 +39,9 @@ A setting of the task is given as --env.options.KEY VALUE."""
 _RECORD = """\
 Greedy episodes of a trained agent on training goals. Those that reach the goal are written, up to the step that
 does, as demonstrations for other agents: routes, states and actions."""
+_REPORT = """\
+One page with the curves of the runs over each other, how their regions grew, what they are worth to the Commander,
+the settings in which the runs differ, and films. It needs no network. A run may still be going on."""
 _OVERRIDES = "Any setting can be overridden: --section.key VALUE (see `star settings`)."
 
 
@@ -98,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_render(commands.add_parser("render", help="pictures of a task or of an agent", description=_RENDER, **shape))
     _add_record(commands.add_parser("record", help="demonstrations by a trained agent", description=_RECORD, **shape))
+    _add_report(commands.add_parser("report", help="runs as one HTML page", description=_REPORT, **shape))
     listing = commands.add_parser("envs", help="list the tasks", **shape)
     listing.set_defaults(function=_envs)
     settings = commands.add_parser("settings", help="list every setting with its default and meaning", **shape)
@@ -140,6 +145,13 @@ def _add_record(record: argparse.ArgumentParser) -> None:
     record.add_argument("--force", action="store_true", help="replace an existing file")
     record.add_argument("--quiet", action="store_true", help="no progress")
     record.set_defaults(function=_record)
+
+
+def _add_report(report: argparse.ArgumentParser) -> None:
+    report.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run directory")
+    report.add_argument("--out", type=Path, required=True, metavar="FILE", help=".html")
+    report.add_argument("--force", action="store_true", help="replace an existing file")
+    report.set_defaults(function=_report)
 
 
 def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
@@ -310,6 +322,26 @@ def _record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
             quiet=options.quiet,
         )
     )
+    return 0
+
+
+def _report(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    _refuse(overrides)
+    from envs import EnvError, files
+
+    try:
+        files.check(options.out, (".html",), force=options.force)
+    except EnvError as error:
+        raise ConfigError(str(error)) from None
+    runs: dict[Path, Config] = {}
+    for run in options.runs:
+        if run.resolve() in {other.resolve() for other in runs}:
+            raise ConfigError(f"{run}: is given twice")
+        runs[run] = _run_config(run, {})
+
+    from star import page
+
+    print(page.write(runs, options.out))
     return 0
 
 

@@ -340,6 +340,14 @@ def on_split(state: CommanderState, *, parent: Int[Array, ""], child: Int[Array,
     )
 
 
+def towards(
+    state: CommanderState, allowed: Successors, goal_region: Int[Array, ""]
+) -> tuple[Float[Array, "R"], Int[Array, "R"]]:
+    """For g* in `goal_region`: the value of every region, and the target that is best there, the first of equals."""
+    values = jnp.where(allowed.greedy, state.q[:, goal_region], -jnp.inf)
+    return _best(state.q, allowed.greedy)[:, goal_region], jnp.argmax(values, axis=-1)
+
+
 def _best(q: Float[Array, "R R R"], allowed: Bool[Array, "R R"]) -> Float[Array, "R R"]:
     """Value of every region and goal region; 0 for regions that are not in use."""
     return jnp.where(allowed.any(axis=1)[:, None], jnp.where(allowed[:, None], q, -jnp.inf).max(axis=-1), 0.0)

@@ -51,6 +51,20 @@ def bootstrap(values: Sequence[float], statistic: Callable[..., Any]) -> tuple[f
     return middle, float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
+def mean_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(mean, low, high), each [T], of the rows of `values` [n, T], with 95 % percentile bootstrap intervals over rows.
+
+    A single row is its own interval; where a value is NaN, so are all three.
+    """
+    n = len(values)
+    mean = values.mean(axis=0)
+    if n < 2:
+        return mean, mean, mean
+    weights = np.random.default_rng(0).multinomial(n, np.full(n, 1 / n), size=4999) / n
+    low, high = np.quantile(weights @ values, (0.025, 0.975), axis=0)
+    return mean, low, high
+
+
 def mean_interval(values: np.ndarray) -> list[float]:
     """Student's t interval of a mean at 95 %; a single value is its own interval."""
     mean = float(values.mean())

@@ -13,6 +13,8 @@ from typing import Any, Self
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from star.config import ConfigError
+
 
 class JsonLines:
     """A file with one object a line, flushed at once."""
@@ -27,11 +29,23 @@ class JsonLines:
             file.write(json.dumps(clean) + "\n")
 
     def read(self) -> list[dict[str, Any]]:
-        """All complete lines so far."""
+        """All complete lines so far; raises `ConfigError` in one line that says which is none of ours."""
         if not self.path.exists():
             return []
-        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
-        return [json.loads(line) for line in lines if line.endswith("\n")]
+        try:
+            lines = self.path.read_bytes().splitlines(keepends=True)
+        except OSError as error:
+            raise ConfigError(f"{self.path}: cannot be read: {error.strerror}") from None
+        return [self._parsed(line, number) for number, line in enumerate(lines, 1) if line.endswith(b"\n")]
+
+    def _parsed(self, line: bytes, number: int) -> dict[str, Any]:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            row = None
+        if not isinstance(row, dict):
+            raise ConfigError(f"{self.path}: line {number} is not a JSON object")
+        return row
 
     def keep_until(self, env_steps: int) -> None:
         """Drop what was written after `env_steps`, for a run that goes on from there."""
@@ -45,15 +59,20 @@ class JsonLines:
 
 @dataclass(frozen=True)
 class Journal:
-    """What a run writes down: `metrics.jsonl`, a line for each epoch and seed, and `regions.jsonl`, for evaluations."""
+    """What a run writes down.
+
+    `metrics.jsonl` has a line for each epoch and seed, `regions.jsonl` for each evaluation and seed, and
+    `provenance.jsonl` for each time that the run began or went on.
+    """
 
     metrics: JsonLines
     regions: JsonLines
+    provenance: JsonLines
 
     @classmethod
     def of(cls, run_dir: Path) -> Journal:
         """That of a run directory."""
-        return cls(JsonLines(run_dir / "metrics.jsonl"), JsonLines(run_dir / "regions.jsonl"))
+        return cls(*(JsonLines(run_dir / f"{name}.jsonl") for name in ("metrics", "regions", "provenance")))
 
 
 class Display:

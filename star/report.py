@@ -9,13 +9,16 @@ from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Array
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from star.config import SgimConfig
+from star import commander, episode
+from star.abstraction import locate
+from star.config import AgentConfig
 from star.sgim import selection
 from star.state import TrainState
 
@@ -25,30 +28,55 @@ _GROWTH_PANELS = 4
 Row = Mapping[str, Any]
 
 
-def region_rows(state: TrainState, seeds: Sequence[int], *, env_steps: int, sgim: SgimConfig) -> list[dict[str, Any]]:
+def region_rows(
+    config: AgentConfig, state: TrainState, *, seeds: Sequence[int], env_steps: int, goal: np.ndarray
+) -> list[dict[str, Any]]:
     """The abstraction of every seed (leading axis of `state`) as plain values, a row of `regions.jsonl` each.
 
-    `lower` and `upper` are the corners of the regions in use, `chosen` how often the Commander chose each of late. With
-    SGIM there are its `competence` in each region, and `drawn`, the share of its choices that fall there.
+    `lower` and `upper` are the corners of the regions in use, `chosen` how often the Commander chose each of late,
+    `visited` how many of its decisions of late began there (of a learned model only). `value` is the Commander's value
+    of each for `goal` [d], a test goal, `target` the index of the region it would choose there. `reaches` and `misses`
+    are pairs of indices: the edges of the graph, and what was shown unreachable. With SGIM there are its `competence`
+    in each region, and `drawn`, the share of its choices that fall there.
     """
+    tables = _tables(config, jax.numpy.asarray(goal), state)
+    verdicts = {"reaches": state.graph.reaches, "misses": state.graph.misses}
+    found, pairs, count = jax.device_get((tables, verdicts, state.abstraction.count))
+
+    def of(table: np.ndarray, index: int) -> list[Any]:
+        values = table[index, : count[index]]
+        return (np.round(values.astype(float), 4) if values.dtype.kind == "f" else values).tolist()
+
+    return [
+        {"seed": seed, "env_steps": env_steps, "goal": np.round(goal.astype(float), 4).tolist()}
+        | {name: of(table, i) for name, table in found.items()}
+        | {name: np.argwhere(table[i, : count[i], : count[i]]).tolist() for name, table in pairs.items()}
+        for i, seed in enumerate(seeds)
+    ]
+
+
+@jax.jit
+def _tables(config: AgentConfig, goal: Array, states: TrainState) -> dict[str, Array]:
+    """What is known of each region of every seed, leading axes [seeds, R]."""
+    return jax.vmap(partial(_table, config, goal))(states)
+
+
+def _table(config: AgentConfig, goal: Array, state: TrainState) -> dict[str, Array]:
+    goal_region = locate(state.abstraction, goal)
+    value, target = commander.towards(state.commander, episode.successors(config, state), goal_region)
     tables = {
         "lower": state.abstraction.lower,
         "upper": state.abstraction.upper,
         "chosen": state.commander.chosen,
+        "value": value,
+        "target": target,
     }
+    if state.commander.model is not None:
+        tables["visited"] = state.commander.model.led.sum(axis=(1, 2))
     if state.sgim is not None:
-        tables["competence"] = jax.vmap(selection.competence)(state.sgim)
-        drawn = jax.vmap(partial(selection.probabilities, sgim.selection))(state.sgim)
-        tables["drawn"] = drawn.sum(axis=-1)
-    found, count = jax.device_get((tables, state.abstraction.count))
-
-    def of(table: np.ndarray, index: int) -> list[Any]:
-        return np.round(table[index, : count[index]].astype(float), 4).tolist()
-
-    return [
-        {"seed": seed, "env_steps": env_steps} | {name: of(table, i) for name, table in found.items()}
-        for i, seed in enumerate(seeds)
-    ]
+        tables["competence"] = selection.competence(state.sgim)
+        tables["drawn"] = selection.probabilities(config.sgim.selection, state.sgim).sum(axis=-1)
+    return tables
 
 
 def summary_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], walls: np.ndarray) -> None:

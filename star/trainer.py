@@ -19,7 +19,7 @@ from rich.console import Console
 import envs
 from envs import arena
 from envs.vector import VectorEnv
-from star import episode, evaluation, hierarchy, report
+from star import episode, evaluation, hierarchy, provenance, report
 from star import state as states
 from star.checkpoint import Checkpoints, check_compatible
 from star.config import Config, ConfigError, TeacherConfig
@@ -43,6 +43,8 @@ class Program:
     config: Config
     spec: Spec
     walls: np.ndarray
+    goal: np.ndarray
+    """A test goal as an abstract point [d]: the one of the task, or one of several."""
     init: Callable[[jax.Array], TrainState]
     lessons: Callable[[], tuple[Demonstrations, ...]]
     """What the teachers show, read when it is first needed; raises `ConfigError`."""
@@ -107,6 +109,7 @@ def build(config: Config) -> Program:
         config=config,
         spec=spec,
         walls=np.asarray(env.arena.walls()),
+        goal=_a_goal(spec, test_env),
         init=lambda keys: init(agent, keys),
         lessons=lessons,
         epoch=lambda state: jitted_epoch(agent, lessons(), state),
@@ -128,6 +131,8 @@ def train(
     else:
         _prepare(run_dir, program.config)
         state = jax.device_put(program.init(seed_keys(program)), jax.devices()[0])  # as a restored one is
+    began = int(state.epoch[0]) * program.env_steps_per_epoch
+    journal.provenance.write({"env_steps": began} | provenance.here())
     try:
         return _loop(program, state, run_dir, checkpoints, journal, quiet=quiet, console=console)
     finally:
@@ -236,7 +241,7 @@ def _loop(
                 _add_evaluation(table, program.evaluate(state, evaluation_keys(program, done)))
                 success = mean(table, "eval/success_final")
                 if program.config.commander.enabled:
-                    regions.extend(report.region_rows(state, seeds, env_steps=env_steps, sgim=program.config.sgim))
+                    regions.extend(_region_rows(program, state, env_steps=env_steps))
                     for region_row in regions[-len(seeds) :]:
                         journal.regions.write(region_row)
             for row in table:
@@ -253,13 +258,19 @@ def _loop(
             checkpoints.save(env_steps, state, program.config, success=_or_zero(success))
     if program.config.commander.enabled and not (regions and regions[-1]["env_steps"] == env_steps):
         # stopped between evaluations
-        regions.extend(report.region_rows(state, seeds, env_steps=env_steps, sgim=program.config.sgim))
+        regions.extend(_region_rows(program, state, env_steps=env_steps))
     report.summary_figure(run_dir / "figures" / "summary.png", regions=regions, rows=rows, walls=program.walls)
     if regions:
         report.growth_figure(run_dir / "figures" / "growth.png", regions=regions, walls=program.walls)
     if rows and program.config.sgim.enabled:
         report.sgim_figure(run_dir / "figures" / "sgim.png", regions=regions, rows=rows, walls=program.walls)
     return Result(run_dir, env_steps, stopped, success)
+
+
+def _region_rows(program: Program, state: TrainState, *, env_steps: int) -> list[dict[str, Any]]:
+    return report.region_rows(
+        program.config.agent(), state, seeds=program.seeds, env_steps=env_steps, goal=program.goal
+    )
 
 
 def _rows(metrics: dict[str, jax.Array], seeds: list[int]) -> list[dict[str, Any]]:
@@ -346,6 +357,12 @@ def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: An
     if teacher.flaw == "wrong_half":
         return teachers.wrong_half(demos, spec.goal_point(tested.reset(jax.random.key(0)).obs))
     return demos
+
+
+def _a_goal(spec: Spec, env: Any) -> np.ndarray:
+    """A goal that `env` draws, as an abstract point [d]; dimensions that goals leave open are 0."""
+    goal = env.draw_goal(jax.random.key(0))
+    return np.asarray(spec.goal_point(jax.numpy.concatenate([jax.numpy.zeros(spec.state_dim), goal])))
 
 
 def make_env(config: Config, goals: str, **others: Any) -> Any:

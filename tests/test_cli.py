@@ -24,6 +24,7 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "ant.yaml").write_text("env: {name: ant_maze}\ntrainer: {num_envs: 8}\n")
     (tmp_path / "old.png").write_text("precious")
     (tmp_path / "old.npz").write_text("precious")
+    (tmp_path / "old.html").write_text("precious")
     (tmp_path / "broken.yaml").write_text("tutor:\n  period: [5\ntrainer: {}\n")
     run = tmp_path / "runs" / "old"
     run.mkdir(parents=True)
@@ -125,6 +126,15 @@ def refusal(capsys, folder, arguments):
         pytest.param("record runs/old --out a/b.npz", "there is no folder a", id="record into no folder"),
         pytest.param("record runs/old --out old.npz", "old.npz: exists; replace it with --force", id="record over"),
         pytest.param("record runs/old --out a.npz --episodes 0", "from 1 to 10000", id="record no episode"),
+        pytest.param("report runs/old", "required: --out", id="report into nothing"),
+        pytest.param("report --out a.html", "required: RUN", id="report nothing"),
+        pytest.param("report runs/new --out a.html", "runs/new: is not a run directory", id="report a non-run"),
+        pytest.param("report runs/old --out a.html", "runs/old: its metrics.jsonl holds no", id="report an empty run"),
+        pytest.param("report runs/old runs/../runs/old --out a.html", "is given twice", id="report a run twice"),
+        pytest.param("report runs/old --out a.pdf", "a.pdf: cannot tell what to write", id="report an odd ending"),
+        pytest.param("report runs/old --out a/b.html", "there is no folder a", id="report into no folder"),
+        pytest.param("report runs/old --out old.html", "old.html: exists; replace it with --force", id="report over"),
+        pytest.param("report runs/old --out a.html --tutor.period 5", "takes no settings", id="report with a setting"),
         pytest.param("settings tutr", "tutr: no setting begins so", id="unknown prefix"),
         pytest.param("settings --tutor.period=5", "takes no settings", id="settings with a setting"),
         pytest.param("envs --tutor.period 5", "takes no settings", id="envs with a setting"),
@@ -274,6 +284,7 @@ def test_help_shows_how_to_train_resume_and_evaluate(capsys, arguments):
         "star evaluate",
         "star render",
         "star record",
+        "star report",
         "star envs",
         "star settings",
     ):

@@ -320,3 +320,12 @@ def test_a_new_region_inherits_rows_columns_and_half_the_visits_of_its_parent():
 def test_nobody_practises_without_a_commander():
     assert commander.practice(settings(practice=0.3)) == 0.3
     assert commander.practice(settings(practice=0.3, enabled=False)) == 0.0
+
+
+def test_the_value_towards_a_goal_is_that_of_the_best_allowed_target():
+    state, allowed = random_state(3)
+    value, target = map(np.asarray, commander.towards(state, allowed, jnp.asarray(2)))
+    q, greedy = np.asarray(state.q), np.asarray(allowed.greedy)
+    for region in range(R):
+        best = max((j for j in range(R) if greedy[region, j]), key=lambda j: q[region, 2, j])
+        assert target[region] == best and value[region] == q[region, 2, best]

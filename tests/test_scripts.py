@@ -114,8 +114,6 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
     script, trained = load("reproduce"), []
 
     def run(command, **kwargs):
-        if "git" in command or "-c" in command:
-            return argparse.Namespace(stdout="")
         _, _, _, verb, *rest = command
         if verb == "train":
             folder, count = Path(rest[rest.index("--run-dir") + 1]), int(rest[rest.index("--seeds") + 1])
@@ -125,6 +123,8 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
             (folder / "checkpoints").mkdir(parents=True)
             rows = "".join(json.dumps(row | {"seed": seed}) + "\n" for seed in seeds)
             (folder / "metrics.jsonl").write_text(rows, encoding="utf-8")
+            start = {"env_steps": 0, "commit": "abc", "device": "abacus", "python": "3", "versions": {}}
+            (folder / "provenance.jsonl").write_text(json.dumps(start) + "\n", encoding="utf-8")
             return None
         seeds = [json.loads(line)["seed"] for line in (Path(rest[0]) / "metrics.jsonl").read_text().splitlines()]
         report = {"seeds": [{"seed": seed, "success_any": 1.0, "success_final": seed / 4} for seed in seeds]}
@@ -142,6 +142,7 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
         ([0, 1], "c0ffee"),
         ([2, 3, 4], "c0ffee"),
     ]
+    assert {program["device"] for program in kept["runs"]} == {"abacus"}
     assert {seed["training_seconds_to_level"] for seed in kept["seeds"]} == {5.0}
     script.main(["point_maze", "star", "--seeds", "1", "--out", str(tmp_path / "c"), *common, "--", "--seed", "7"])
     assert trained[-1] == [0] and len(list((tmp_path / "runs" / "point_maze").glob("star-0-*"))) == 2

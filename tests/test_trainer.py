@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -94,7 +95,7 @@ def test_a_run_leaves_config_metrics_checkpoints_and_figure(finished):
     run_dir, result = finished
     assert result.env_steps == 4 * EPOCH and not result.interrupted
     assert {entry.name for entry in run_dir.iterdir()} == {
-        "config.yaml", "metrics.jsonl", "regions.jsonl", "checkpoints", "figures",
+        "config.yaml", "metrics.jsonl", "regions.jsonl", "provenance.jsonl", "checkpoints", "figures",
     }  # fmt: skip
     for name in ("summary", "growth"):
         assert (run_dir / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
@@ -123,7 +124,11 @@ def test_regions_have_a_line_for_each_evaluation_and_seed_and_cover_the_space(fi
         lower, upper = np.array(row["lower"]), np.array(row["upper"])
         assert np.prod(upper - lower, axis=1).sum() == pytest.approx(24.0**2)
         same = [r for r in metrics if (r["env_steps"], r["seed"]) == (row["env_steps"], row["seed"])]
-        assert len(lower) == len(row["chosen"]) == same[0]["abstraction/regions"]
+        assert len(lower) == same[0]["abstraction/regions"]
+        assert {len(row[key]) for key in ("chosen", "visited", "value", "target")} == {len(lower)}
+        assert row["goal"] == [0, 16] and max(row["target"]) < len(lower)
+        assert len(row["reaches"]) == same[0]["refinement/edges"]
+        assert len(row["misses"]) == same[0]["refinement/misses"]
 
 
 @pytest.mark.parametrize(
@@ -137,6 +142,16 @@ def test_the_figure_of_growth_shows_the_regions_at_the_moments_asked_for(tmp_pat
     monkeypatch.setattr(report, "draw_regions", lambda axis, row, walls: drawn.append((row["seed"], row["env_steps"])))
     report.growth_figure(tmp_path / "growth.png", regions=regions, walls=[], moments=moments)
     assert drawn == [(3, n) for n in shown]
+
+
+def test_a_run_notes_each_time_it_begins_with_what_and_where(finished, tmp_path):
+    run_dir, _ = finished
+    (start,) = Journal.of(run_dir).provenance.read()
+    assert start["env_steps"] == 0 and start["device"].startswith("CPU, ")
+    assert start["versions"]["jax"] == jax.__version__
+    shutil.copytree(run_dir, tmp_path / "run")
+    trainer.train(tiny(), tmp_path / "run", resume=True, quiet=True)
+    assert [row["env_steps"] for row in Journal.of(tmp_path / "run").provenance.read()] == [0, 4 * EPOCH]
 
 
 def test_seeds_differ(finished):

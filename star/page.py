@@ -1,0 +1,326 @@
+"""The report: runs as one HTML page that needs no network and no other file.
+
+    read      what a run left on disk
+    content   what the page shows of it, as plain values: curves thinned and summarised, regions at some moments
+    write     star/assets/report.html with its style, its script and these values as JSON in it
+
+All that a user may have named reaches the page as JSON and is drawn as text, never as markup.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import re
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envs import files, video
+from envs.arena import ROBOT
+from envs.options import EnvError
+from star import evaluation, trainer
+from star.config import Config, ConfigError
+from star.metrics import Journal, JsonLines
+
+MAX_POINTS = 300  # of a curve
+MAX_BOXES = 24_000  # regions of all runs in all frames together
+MAX_FILM = 1_500_000  # bytes of a film in the page
+
+Row = Mapping[str, Any]
+Kinds = Mapping[str, type | tuple[type, ...]]
+
+_MARK = '<meta name="generator" content="star report">'
+_SMALL_FILM = ("--every", "5", "--fps", "10", "--height", "240")  # about 1 MB for an episode of 500 env steps
+_NUMBER = (int, float)
+_METRICS: Kinds = {"seed": int, "env_steps": int, "wall_s": _NUMBER, "env_steps_per_s": _NUMBER}
+_REGIONS: Kinds = {"seed": int, "env_steps": int, "lower": list, "upper": list, "chosen": list}
+_PROVENANCE: Kinds = {"env_steps": int, "time": str, "device": str, "python": str, "versions": dict}
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run left on disk. `epochs` are the complete ones: a row for each seed, in the order of the seeds."""
+
+    path: Path
+    name: str
+    config: Config
+    epochs: list[list[Row]]
+    regions: list[Row]
+    starts: list[Row]
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds trained side by side."""
+        return [row["seed"] for row in self.epochs[0]]
+
+    @property
+    def evaluations(self) -> list[list[Row]]:
+        """The epochs in which the seeds were evaluated."""
+        return [rows for rows in self.epochs if all("eval/success_final" in row for row in rows)]
+
+
+def write(runs: Mapping[Path, Config], out: Path) -> str:
+    """Write the report of `runs` (directory: configuration) to `out`; returns a line that says what was written.
+
+    An existing file is replaced.
+
+    Raises:
+      ConfigError: in one line, if a run or `out` cannot be used; nothing is written then.
+    """
+    trainer.select_device("cpu")  # a GPU may be busy with one of the runs
+    try:
+        found = [read(path, config, name=name) for (path, config), name in zip(runs.items(), names(runs), strict=True)]
+        page = html(content(found))
+        with files.whole(out) as partial:
+            partial.write_text(page, encoding="utf-8")
+    except EnvError as error:
+        raise ConfigError(str(error)) from None
+    return f"{out}: {len(found)} run{'s' * (len(found) > 1)}, {out.stat().st_size / 1e6:.1f} MB; open it in a browser"
+
+
+def names(paths: Iterable[Path]) -> list[str]:
+    """What to call runs: the name of the directory, or the whole path where several directories have the same name."""
+    short = {path: path.resolve().name for path in paths}
+    taken = list(short.values())
+    return [name if taken.count(name) == 1 else str(path) for path, name in short.items()]
+
+
+def read(run_dir: Path, config: Config, *, name: str) -> Run:
+    """The complete lines of a run, which may still be going on.
+
+    Raises:
+      ConfigError: in one line, if there is no complete epoch yet, or a line is not what a run writes.
+    """
+    journal = Journal.of(run_dir)
+    seeds = config.trainer.num_seeds
+    epochs = _by_step(_checked(journal.metrics, _METRICS), seeds)
+    if not epochs:
+        raise ConfigError(f"{run_dir}: its metrics.jsonl holds no complete epoch, so there is nothing to show yet")
+    return Run(
+        path=run_dir,
+        name=name,
+        config=config,
+        epochs=epochs,
+        regions=[row for rows in _by_step(_checked(journal.regions, _REGIONS), seeds) for row in rows],
+        starts=_checked(journal.provenance, _PROVENANCE),
+    )
+
+
+def _checked(lines: JsonLines, kinds: Kinds) -> list[Row]:
+    """The rows, if all have the keys of `kinds` with values of these kinds; lists must be of one length."""
+    rows = lines.read()
+    for number, row in enumerate(rows, 1):
+        for key, kind in kinds.items():
+            if not isinstance(row.get(key), kind):
+                raise ConfigError(
+                    f"{lines.path}: line {number}: {key} is {_worded(row.get(key))[:60]}, which no run writes"
+                )
+        if len({len(row[key]) for key, kind in kinds.items() if kind is list}) > 1:
+            raise ConfigError(f"{lines.path}: line {number}: its lists differ in length")
+    return list(rows)
+
+
+def _by_step(rows: Sequence[Row], seeds: int) -> list[list[Row]]:
+    """The rows of each moment that all `seeds` have written; of the last one some may be missing."""
+    found: dict[int, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row["env_steps"], []).append(row)
+    return [sorted(found[step], key=lambda row: row["seed"]) for step in sorted(found) if len(found[step]) == seeds]
+
+
+def content(runs: Sequence[Run]) -> dict[str, Any]:
+    """All that the page shows, as values that JSON can hold."""
+    return {
+        "made": {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", "version": metadata.version("star-rl")},
+        "runs": [_shown(run, most=MAX_BOXES // len(runs)) for run in runs],
+        "settings": differences([run.config for run in runs]),
+    }
+
+
+def _shown(run: Run, *, most: int) -> dict[str, Any]:
+    return {
+        "name": run.name,
+        "task": run.config.env.name,
+        "seeds": run.seeds,
+        "facts": facts(run),
+        "evaluations": evaluation_curves(run.evaluations),
+        "epochs": epoch_curves(run.epochs),
+        "map": growth(run, most=most) if run.regions else None,
+        "film": film(run.path),
+        "config": run.config.to_yaml(),
+    }
+
+
+def facts(run: Run) -> dict[str, Any]:
+    """How far the run is, how well it does, what it was made with, and how to make it again.
+
+    The shares of success are [mean, low, high] over seeds in the last evaluation, or None before the first.
+    """
+    last = run.epochs[-1][0]
+    regions = _table(run.epochs[-1:], "abstraction/regions")
+    best = {name: _table(run.evaluations[-1:], f"eval/{name}") for name in ("success_any", "success_final")}
+    return {
+        "env_steps": last["env_steps"],
+        "total_env_steps": run.config.trainer.total_env_steps,
+        "wall_s": last["wall_s"],
+        # the first epoch compiles
+        "env_steps_per_s": float(np.median(_table(run.epochs[1:] or run.epochs, "env_steps_per_s")[0])),
+        "regions": _short(regions.mean(axis=0))[0],
+        "path": str(run.path),
+        "engine": run.config.env.engine,
+        "command": shlex.join(["star", "train", str(run.path / "config.yaml"), "--run-dir", f"{run.path}-again"]),
+        "starts": run.starts,
+    } | {name: _short(np.ravel(evaluation.mean_band(table))) or None for name, table in best.items()}
+
+
+def evaluation_curves(epochs: Sequence[Sequence[Row]]) -> dict[str, Any]:
+    """What was measured on test goals, as curves over `env_steps` and `wall_s`, thinned to `MAX_POINTS`.
+
+    Each has the `mean` over seeds, `low` and `high` (95 % bootstrap interval of that mean), and the `seeds` themselves.
+    """
+    found: dict[str, Any] = _clocks(epochs)
+    for key in _numbers(epochs, "eval/"):
+        table = _thin(_table(epochs, key))
+        mean, low, high = map(_short, evaluation.mean_band(table))
+        found[key] = {"mean": mean, "low": low, "high": high, "seeds": [_short(row) for row in table]}
+    return found
+
+
+def epoch_curves(epochs: Sequence[Sequence[Row]]) -> dict[str, list[float | None]]:
+    """All other metrics, means over seeds, as curves over `env_steps` and `wall_s`, thinned to `MAX_POINTS`."""
+    keys = [
+        key
+        for key in _numbers(epochs, "")
+        if not key.startswith("eval/") and key not in ("seed", "env_steps", "wall_s")
+    ]
+    return _clocks(epochs) | {key: _short(_thin(_table(epochs, key)).mean(axis=0)) for key in keys}
+
+
+def _clocks(epochs: Sequence[Sequence[Row]]) -> dict[str, list[float | None]]:
+    return {key: _short(_thin(_table(epochs, key)[:1])[0], digits=7) for key in ("env_steps", "wall_s")}
+
+
+def _numbers(epochs: Sequence[Sequence[Row]], prefix: str) -> list[str]:
+    """The keys of the last epoch that begin with `prefix`."""
+    return sorted(key for key in (epochs[-1][0] if epochs else ()) if key.startswith(prefix))
+
+
+def _table(epochs: Sequence[Sequence[Row]], key: str) -> np.ndarray:
+    """[seeds, epochs] of a metric; NaN where there is no number."""
+    found = [[row.get(key) for row in rows] for rows in epochs]
+    values = [[value if isinstance(value, _NUMBER) else math.nan for value in row] for row in found]
+    return np.asarray(values, float).reshape(-1, len(values[0]) if values else 1).T
+
+
+def _thin(table: np.ndarray) -> np.ndarray:
+    """[n, T] with means of neighbours where T is more than `MAX_POINTS`."""
+    if table.shape[1] <= MAX_POINTS:
+        return table
+    return np.stack([part.mean(axis=1) for part in np.array_split(table, MAX_POINTS, axis=1)], axis=1)
+
+
+def _short(values: Any, *, digits: int = 4) -> list[float | None]:
+    """Numbers with few digits; None for those that JSON cannot hold."""
+    return [float(f"{v:.{digits}g}") if math.isfinite(v) else None for v in np.asarray(values, float)]
+
+
+def growth(run: Run, *, most: int = MAX_BOXES) -> dict[str, Any]:
+    """The abstraction of every seed as it grew, over the walls, at as many moments as hold `most` regions together.
+
+    `boxes` are corners [x, y, .., x, y, ..] that `frames` name by index, so that a region that stays takes little
+    room. `chosen`, `visited` and `drawn` are shares in %, other tables are as in `regions.jsonl`.
+    """
+    config = run.config.model_copy(update={"env": run.config.env.model_copy(update={"engine": "auto"})})
+    env = trainer.make_env(config, "test")
+    robots = env.arena.centres(ROBOT)
+    boxes: dict[tuple[float | None, ...], int] = {}
+    frames: dict[int, list[dict[str, Any]]] = {seed: [] for seed in run.seeds}
+    for row in _fewer(run.regions, most):
+        if row["seed"] in frames:
+            frames[row["seed"]].append(_frame(row, boxes))
+    return {
+        "axes": ["xyz"[i] if i < 3 else f"state {i}" for i in env.abstract_indices],
+        "walls": np.round(env.arena.walls(), 3).tolist(),
+        "chasms": np.round(env.arena.chasms(), 3).tolist(),
+        "start": robots[0].tolist() if len(robots) == 1 else None,
+        "boxes": list(boxes),
+        "frames": [{"seed": seed, "moments": moments} for seed, moments in frames.items()],
+    }
+
+
+def _fewer(rows: Sequence[Row], most: int) -> list[Row]:
+    """The rows of moments evenly apart, the first and the last among them."""
+    steps = sorted({row["env_steps"] for row in rows})
+    shown = max(2, int(len(steps) * min(1.0, most / sum(len(row["lower"]) for row in rows))))
+    kept = {steps[i] for i in np.linspace(len(steps) - 1, 0, min(shown, len(steps))).round().astype(int)}
+    return [row for row in rows if row["env_steps"] in kept]
+
+
+def _frame(row: Row, boxes: dict[tuple[float | None, ...], int]) -> dict[str, Any]:
+    corners = (tuple(_short([*low, *high])) for low, high in zip(row["lower"], row["upper"], strict=True))
+    kept = ("env_steps", "goal", "target", "reaches", "misses")
+    frame = {key: row[key] for key in kept if key in row}
+    frame["box"] = [boxes.setdefault(box, len(boxes)) for box in corners]
+    for key in ("chosen", "visited", "drawn"):
+        if key in row:
+            frame[key] = _short(100 * np.asarray(row[key]) / max(sum(row[key]), 1e-9))
+    return frame | {key: _short(row[key]) for key in ("value", "competence") if key in row}
+
+
+def differences(configs: Sequence[Config]) -> list[dict[str, Any]]:
+    """The settings in which runs differ, as {key, values}; for a single run those that differ from the defaults.
+
+    The defaults are the last of the `values` then.
+    """
+    tables = [_dotted(config.model_dump(mode="json")) for config in configs]
+    if len(tables) == 1:
+        tables.append(_dotted(Config().model_dump(mode="json")))
+    keys = {key: None for table in tables for key in table}
+    rows = ({"key": key, "values": [_worded(table.get(key)) for table in tables]} for key in keys)
+    return [row for row in rows if len(set(row["values"])) > 1]
+
+
+def _dotted(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= _dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
+
+
+def _worded(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def film(run_dir: Path) -> dict[str, Any]:
+    """The newest film in the figures of a run that is small enough, as text or base64, and how to make one."""
+    out = str(run_dir / "figures" / "episode.html")
+    command = shlex.join(["star", "render", "--run", str(run_dir), "--out", out, *_SMALL_FILM])
+    folder = run_dir / "figures"
+    found = [path for path in folder.iterdir() if path.suffix in video.FILMS] if folder.is_dir() else []
+    newest = sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)
+    for path in newest:
+        data = path.read_bytes() if path.stat().st_size <= MAX_FILM else b""
+        if not data or _MARK.encode() in data[:1000]:
+            continue
+        whole = data.decode(errors="replace") if path.suffix == ".html" else base64.b64encode(data).decode()
+        return {"name": path.name, "kind": path.suffix[1:], "data": whole}
+    large = [path.name for path in newest if path.stat().st_size > MAX_FILM]
+    return {"command": command, "large": large}
+
+
+def html(shown: Mapping[str, Any]) -> str:
+    """The page, with style, script and `shown` in it."""
+    assets = resources.files("star").joinpath("assets")
+    parts = {ending: assets.joinpath(f"report.{ending}").read_text(encoding="utf-8") for ending in ("css", "js")}
+    # no text can end the element that holds it
+    parts["json"] = json.dumps(shown, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    page = assets.joinpath("report.html").read_text(encoding="utf-8")
+    return re.sub(r"%(css|js|json)%", lambda found: parts[found[1]], page)  # once: data may hold such words too

@@ -1,0 +1,46 @@
+"""Where and with what a run was made."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+
+_ROOT = Path(__file__).parents[1]
+_PACKAGES = ("star-rl", "jax", "mujoco", "mujoco-mjx", "brax")
+
+
+def here() -> dict[str, Any]:
+    """`time` (UTC), `commit`, `device`, `python` and the `versions` of packages, of this process.
+
+    `commit` is that of the checkout which the code lies in, with a + if it was changed; empty where there is none.
+    """
+    device = jax.devices()[0]
+    cores = len(os.sched_getaffinity(0))
+    return {
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": _commit(),
+        "device": device.device_kind if device.platform == "gpu" else f"CPU, {cores} core{'s' * (cores > 1)}",
+        "python": platform.python_version(),
+        "versions": {name: metadata.version(name) for name in _PACKAGES},
+    }
+
+
+def _commit() -> str:
+    if not (_ROOT / ".git").exists():  # installed: a repository around it is another one
+        return ""
+    try:
+        commit = _git("rev-parse", "--short", "HEAD")
+        return commit + "+" * bool(commit and _git("status", "--porcelain", "star", "envs", "configs"))
+    except OSError:  # there is no git
+        return ""
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", "-C", str(_ROOT), *words], capture_output=True, text=True).stdout.strip()

@@ -1,0 +1,341 @@
+"""The report, from the values in it to what a browser makes of it. The runs are written by hand: nothing is trained."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from star import page
+from star.cli import main
+from star.config import ConfigError
+from star.loading import load, parse
+from tests.browser import program, started
+
+CUTS = [0.0, 8.0, 12.0, 16.0]
+
+
+def lines(path, rows):
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+
+
+def metrics(epochs, seeds, *, every=2, success=lambda seed, epoch: 0.5, **others):
+    """Rows of an epoch of 100 env steps and 2 s each."""
+    rows = []
+    for epoch in range(1, epochs + 1):
+        for seed in seeds:
+            row = {"seed": seed, "controller/actor_loss": seed + epoch, "abstraction/regions": 2}
+            if epoch % every == 0:
+                row |= {f"eval/{name}": success(seed, epoch) for name in ("success_any", "success_final", "distance")}
+            rows.append(row | others | {"env_steps": 100 * epoch, "wall_s": 2.0 * epoch, "env_steps_per_s": 50 + epoch})
+    return rows
+
+
+def strip(number, *, old=False):
+    """Regions from the left to the right wall of the Point Maze, cut at the first `number` of CUTS along y."""
+    edges = [-4.0, *CUTS[:number], 20.0]
+    count = len(edges) - 1
+    row = {
+        "lower": [[-4.0, edge] for edge in edges[:-1]],
+        "upper": [[20.0, edge] for edge in edges[1:]],
+        "chosen": [float(i + 1) for i in range(count)],
+    }
+    known = {"value": [i / count for i in range(count)], "target": [min(i + 1, count - 1) for i in range(count)]}
+    edges = {"reaches": [[i, i + 1] for i in range(count - 1)], "misses": [], "goal": [0.0, 16.0]}
+    return row if old else row | known | edges
+
+
+@pytest.fixture
+def make(tmp_path):
+    """Writes a run directory; four epochs, two evaluations and two seeds if not told otherwise."""
+
+    def write(name="run", *, seeds=(0, 1), rows=None, regions=None, settings=None):
+        folder = tmp_path / name
+        folder.mkdir(parents=True)
+        config = parse({"trainer": {"num_seeds": len(seeds), "total_env_steps": 400}}, settings)
+        (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
+        lines(folder / "metrics.jsonl", metrics(4, seeds) if rows is None else rows)
+        grown = [{"seed": seed, "env_steps": 100 * n} | strip(n // 2) for n in (2, 4) for seed in seeds]
+        lines(folder / "regions.jsonl", grown if regions is None else regions)
+        start = {"time": "2026-01-02T03:04:05+00:00", "commit": "c0ffee", "device": "abacus", "python": "3.11.0"}
+        lines(folder / "provenance.jsonl", [{"env_steps": 0} | start | {"versions": {"jax": "0.10"}}])
+        return folder
+
+    return write
+
+
+def read(folder):
+    return page.read(folder, load(folder / "config.yaml"), name=folder.name)
+
+
+def test_a_curve_is_the_mean_over_seeds_between_the_two_where_there_are_two(make):
+    run = read(make(rows=metrics(4, (0, 1), success=lambda seed, epoch: (0.2, 0.6)[seed] + epoch / 100)))
+    found = page.evaluation_curves(run.evaluations)
+    assert (found["env_steps"], found["wall_s"]) == ([200, 400], [4, 8])
+    success = found["eval/success_final"]
+    assert success == {
+        "mean": [0.42, 0.44],
+        "low": [0.22, 0.24],
+        "high": [0.62, 0.64],
+        "seeds": [[0.22, 0.24], [0.62, 0.64]],
+    }
+    assert page.epoch_curves(run.epochs)["controller/actor_loss"] == [1.5, 2.5, 3.5, 4.5]
+    assert page.facts(run)["success_final"] == [0.44, 0.24, 0.64]
+
+
+def test_the_interval_narrows_with_the_number_of_seeds(make):
+    widths = []
+    for count in (16, 64):
+        rows = metrics(2, range(count), success=lambda seed, epoch: seed % 2)
+        success = page.facts(read(make(f"run{count}", seeds=range(count), rows=rows)))["success_final"]
+        widths.append(success[2] - success[1])
+    assert widths == pytest.approx([2 * 1.96 * 0.5 / 4, 2 * 1.96 * 0.5 / 8], rel=0.15)
+
+
+def test_a_long_curve_is_thinned_to_means_of_neighbours(make):
+    run = read(make(rows=metrics(1000, (0, 1))))
+    found = page.epoch_curves(run.epochs)
+    assert {len(curve) for curve in found.values()} == {page.MAX_POINTS}
+    steps = np.asarray(found["env_steps"])
+    np.testing.assert_allclose(found["controller/actor_loss"], steps / 100 + 0.5, rtol=1e-3)
+    assert (np.diff(steps) > 0).all() and steps[0] > 100 and steps[-1] < 100_000
+
+
+def test_numbers_that_were_not_finite_are_gaps(make):
+    run = read(make(rows=metrics(4, (0, 1), **{"tutor/kl": None})))
+    assert page.epoch_curves(run.epochs)["tutor/kl"] == [None] * 4
+
+
+def test_of_a_run_that_goes_on_only_what_is_complete_is_shown(make):
+    folder = make(rows=[*metrics(3, (0, 1)), metrics(4, (0,))[-1]])
+    with (folder / "metrics.jsonl").open("a") as file:
+        file.write('{"seed": 1, "env_st')
+    facts = page.facts(read(folder))
+    assert (facts["env_steps"], facts["total_env_steps"], facts["wall_s"]) == (300, 400, 6.0)
+
+
+def test_regions_that_only_some_seeds_have_written_yet_are_left_out(make):
+    rows = [{"seed": seed, "env_steps": n} | strip(1) for n, seed in ((200, 0), (200, 1), (400, 0))]
+    assert [row["env_steps"] for row in read(make("a", regions=rows)).regions] == [200, 200]
+    assert page.content([read(make("b", regions=rows[:1]))])["runs"][0]["map"] is None
+
+
+def test_before_the_first_evaluation_there_is_a_report_without_success(make):
+    shown = page.content([read(make(rows=metrics(1, (0, 1)), regions=[]))])["runs"][0]
+    assert (shown["facts"]["success_final"], shown["map"]) == (None, None)
+    assert shown["evaluations"]["env_steps"] == [] and shown["epochs"]["env_steps"] == [100]
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_the_regions_of_every_moment_are_those_of_the_run(make, old):
+    rows = [{"seed": seed, "env_steps": 200 * n} | strip(n, old=old) for n in (1, 2) for seed in (0, 1)]
+    grown = page.growth(read(make(regions=rows)))
+    assert grown["axes"] == ["x", "y"] and grown["start"] == [0, 0] and len(grown["walls"]) > 4
+    for i, row in enumerate(rows):
+        frame = grown["frames"][row["seed"]]["moments"][i // 2]
+        corners = [[*low, *high] for low, high in zip(row["lower"], row["upper"], strict=True)]
+        assert [list(grown["boxes"][i]) for i in frame["box"]] == corners
+        assert sum(frame["chosen"]) == pytest.approx(100, abs=0.1)
+        assert frame.get("reaches") == row.get("reaches") and ("value" in frame) == (not old)
+
+
+def test_many_moments_are_thinned_evenly_and_keep_the_first_and_the_last(make):
+    rows = [{"seed": seed, "env_steps": n} | strip(4) for n in range(1, 101) for seed in (0, 1)]
+    frames = page.growth(read(make(regions=rows)), most=5 * 2 * 12)["frames"]
+    for one in frames:
+        steps = [frame["env_steps"] for frame in one["moments"]]
+        assert len(steps) == 12 and steps[0] == 1 and steps[-1] == 100 and set(np.diff(steps)) == {9}
+
+
+def test_only_settings_that_differ_are_listed():
+    one, other = parse({}), parse({"tutor": {"period": 5}, "env": {"options": {"cell": 4.0}}})
+    differ = page.differences([one, other, one])
+    assert {row["key"]: row["values"] for row in differ} == {
+        "tutor.period": ["10", "5", "10"],
+        "env.options.cell": ["null", "4.0", "null"],
+    }
+    assert [row["values"] for row in page.differences([other])] == [["4.0", "null"], ["5", "10"]]
+    assert page.differences([one]) == []
+
+
+def test_runs_of_the_same_name_are_told_apart_by_their_paths(make):
+    paths = [make("a/run"), make("b/run"), make("c")]
+    assert page.names(paths) == [str(paths[0]), str(paths[1]), "c"]
+
+
+def test_the_newest_small_film_is_shown_and_else_how_to_make_one(make, monkeypatch):
+    folder = make("my run")
+    assert "--run '" in page.film(folder)["command"] and page.film(folder)["large"] == []
+    (folder / "figures").mkdir()
+    page.write({folder: load(folder / "config.yaml")}, folder / "figures" / "report.html")
+    assert "command" in page.film(folder)  # a report is no film
+    (folder / "figures" / "a.gif").write_bytes(b"GIF89a")
+    assert page.film(folder) == {"name": "a.gif", "kind": "gif", "data": "R0lGODlh"}
+    monkeypatch.setattr(page, "MAX_FILM", 5)
+    assert "a.gif" in page.film(folder)["large"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("metrics", "", "run: its metrics.jsonl holds no complete epoch"),
+        ("metrics", "{]\n", "metrics.jsonl: line 1 is not a JSON object"),
+        ("metrics", "\xff\n", "metrics.jsonl: line 1 is not a JSON object"),
+        ("metrics", "[1]\n", "metrics.jsonl: line 1 is not a JSON object"),
+        ("metrics", '{"seed": 0}\n', "metrics.jsonl: line 1: env_steps is null"),
+        ("regions", '{"seed": 0, "env_steps": "many"}\n', "regions.jsonl: line 1: env_steps is many"),
+        (
+            "regions",
+            '{"seed": 0, "env_steps": 1, "lower": [], "upper": [[0]], "chosen": []}\n',
+            "regions.jsonl: line 1: its lists differ in length",
+        ),
+        ("provenance", "{}\n", "provenance.jsonl: line 1: env_steps is null"),
+    ],
+)
+def test_a_file_that_no_run_writes_is_refused_in_one_line_that_says_where(make, name, text, said):
+    folder = make("run")
+    (folder / f"{name}.jsonl").write_text(text, encoding="latin-1")
+    with pytest.raises(ConfigError) as error:
+        read(folder)
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+class Parts(HTMLParser):
+    """The texts of the script elements of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.scripts, self._inside = [], False
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self._inside = tag == "script"
+        self.scripts += [""] if self._inside else []
+
+    def handle_endtag(self, tag):
+        self._inside &= tag != "script"
+
+    def handle_data(self, data):
+        if self._inside:
+            self.scripts[-1] += data
+
+
+def test_what_a_user_named_stays_inside_the_data_and_comes_out_unchanged():
+    nasty = {"a": "</script><script>pwned = 1</script>", "b": "%js% <!-- \\ \u2028 ü"}
+    data, script = Parts(page.html(nasty)).scripts
+    assert json.loads(data) == nasty
+    assert "%js%" not in script and "use strict" in script
+
+
+def test_the_page_of_an_ordinary_run_is_below_two_megabytes(make, tmp_path):
+    seeds = range(5)
+    many = {f"tutor/metric_{i}": i / 7 for i in range(50)}
+    rows = metrics(500, seeds, **many)
+    grown = [{"seed": seed, "env_steps": 1000 * n} | strip(4) for n in range(1, 101) for seed in seeds]
+    for row in grown:  # as many regions as there may be
+        row |= {key: 13 * row[key] for key in ("lower", "upper", "chosen", "value", "target")}
+    folder = make(seeds=seeds, rows=rows, regions=grown)
+    said = page.write({folder: load(folder / "config.yaml")}, tmp_path / "report.html")
+    assert 0.3e6 < (tmp_path / "report.html").stat().st_size < 2e6
+    assert said.endswith("MB; open it in a browser")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    if program() is None:
+        pytest.skip("no Chromium is installed")
+    with started(tmp_path_factory.mktemp("browser")) as browser:
+        yield browser
+
+
+NAME = "<img src=x onerror=pwned=1>"
+
+
+@pytest.fixture
+def two(make, tmp_path):
+    """The report of two runs whose names and settings are out for trouble."""
+    teacher = {"name": "guide", "kind": "decomposition", "source": "</script><script>pwned=1</script>"}
+    shares = {"sgim/share_autonomous": 0.25, "sgim/share_guide": 0.75}
+    rows = metrics(4, (0, 1), success=lambda seed, epoch: (seed + epoch) / 6, **shares)
+    first, second = make(NAME, rows=rows, settings={"sgim.teachers": [teacher]}), make("second")
+    assert main(["report", str(first), str(second), "--out", str(tmp_path / "report.html")]) == 0
+    return tmp_path / "report.html"
+
+
+def text(browser, selector):
+    return browser.run(f"document.querySelector({json.dumps(selector)}).textContent")
+
+
+def count(browser, selector):
+    return browser.run(f"document.querySelectorAll({json.dumps(selector)}).length")
+
+
+def choose(browser, selector, value, event):
+    """Give an input a value, as a user does."""
+    found = f"const input = document.querySelector({json.dumps(selector)})"
+    browser.run(f"{{ {found}; input.value = {json.dumps(value)}; input.dispatchEvent(new Event('{event}')); 0 }}")
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_the_page_opens_from_disk_without_errors_or_requests_and_fits(browser, two, width, dark):
+    browser.open(two, width=width, dark=dark)
+    browser.run("document.querySelectorAll('details').forEach(fold => fold.open = true)")
+    browser.run("new Promise(done => setTimeout(done, 100))")
+    assert (browser.problems, browser.requests) == ([], [two.absolute().as_uri()])
+    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+    assert browser.run("[...document.querySelectorAll('section')].map(section => section.id)") == [
+        "success", "abstraction", "strategies", "throughput", "levels", "films", "settings", "provenance",
+    ]  # fmt: skip
+    background = browser.run("getComputedStyle(document.body).backgroundColor")
+    assert (sum(map(int, re.findall(r"\d+", background)[:3])) < 384) == dark
+
+
+def test_names_and_settings_are_shown_as_they_are_and_never_run(browser, two):
+    browser.open(two)
+    assert browser.run("typeof pwned") == "undefined"
+    assert NAME in text(browser, "h1") and "</script><script>pwned=1" in text(browser, "#settings")
+
+
+MAP = "#abstraction figure:first-child"
+
+
+def test_the_slider_shows_the_regions_of_its_moment(browser, two):
+    browser.open(two)
+    assert (count(browser, f"{MAP} .region"), text(browser, "#abstraction output")) == (3, "400 env steps")
+    choose(browser, "#moment", "0", "input")
+    assert (count(browser, f"{MAP} .region"), text(browser, "#abstraction output")) == (2, "200 env steps")
+    assert text(browser, f"{MAP} figcaption") == "2 regions at 200 env steps"
+
+
+def test_edges_can_be_shown_and_a_region_tells_its_values(browser, two):
+    browser.open(two)
+    assert count(browser, f"{MAP} .edge") == 0
+    choose(browser, "select[aria-label=arrows]", "reaches", "change")
+    assert count(browser, f"{MAP} .edge") == 2 and text(browser, f"{MAP} figcaption").endswith("2 edges")
+    fill = f"document.querySelector('{MAP} .region').getAttribute('fill')"
+    before = browser.run(fill)
+    choose(browser, "select[aria-label=colour]", "value", "change")
+    assert browser.run(fill) == "rgb(68,1,84)" != before
+    event = "new PointerEvent('pointermove', { bubbles: true })"
+    browser.run(f"document.querySelector('{MAP} .region').dispatchEvent({event})")
+    assert text(browser, f"{MAP} figcaption") == (
+        "Region 0: x −4 to 20, y −4 to 0; chosen 16.7 %, value 0, plan: region 1."
+    )
+
+
+def test_success_can_be_seen_over_the_wall_clock(browser, two):
+    browser.open(two)
+    assert "env steps" in text(browser, "#success svg") and "wall-clock" not in text(browser, "#success svg")
+    browser.run("document.querySelector('#success input[value=wall_s]').click()")
+    assert "wall-clock, s" in text(browser, "#success svg") and count(browser, "#success .band") == 2
+
+
+def test_a_single_run_has_its_value_map_with_the_plan_beside_what_was_chosen(browser, make, tmp_path):
+    folder = make()
+    page.write({folder: load(folder / "config.yaml")}, tmp_path / "report.html")
+    browser.open(tmp_path / "report.html")
+    assert count(browser, "#abstraction .grid:not(.stills) > figure") == 2
+    assert count(browser, "#abstraction figure:nth-child(2) .plan .edge") == 2
+    assert count(browser, "#abstraction .stills figure") == 2 and browser.problems == []
