@@ -34,9 +34,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy import stats
 
-from star.evaluation import bootstrap
+from star.evaluation import bootstrap, interquartile_mean
 from star.metrics import JsonLines
 
 ROOT = Path(__file__).parents[1]
@@ -133,11 +132,6 @@ def provenance(commit: str | None) -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": {name: metadata.version(name) for name in names},
     }
-
-
-def interquartile_mean(values: np.ndarray) -> float:
-    """Mean of the middle half."""
-    return float(stats.trim_mean(values, 0.25))
 
 
 def table(reports: list[dict[str, Any]]) -> str:

@@ -61,10 +61,17 @@ class Checkpoints:
 
     def config(self, step: int) -> Config:
         """The configuration inside a checkpoint."""
-        saved = self._open().restore(step, args=ocp.args.Composite(config=ocp.args.JsonRestore()))["config"]
-        if saved.get("format") != FORMAT:
-            raise ConfigError(f"{self._path / str(step)}: checkpoint format {saved.get('format')} is not {FORMAT}")
-        return parse(saved["config"], source=str(self._path / str(step)))
+        path = self._path / str(step)
+        try:
+            saved = self._open().restore(step, args=ocp.args.Composite(config=ocp.args.JsonRestore()))["config"]
+            number = saved["format"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(f"{path}: is damaged, its config cannot be read: {_reason(error)}") from None
+        if isinstance(number, int) and number > FORMAT:
+            raise ConfigError(f"{path}: checkpoint format {number} is newer than {FORMAT}, which this version reads")
+        if number != FORMAT:
+            raise ConfigError(f"{path}: checkpoint format {number} is not {FORMAT}")
+        return parse(saved["config"], source=str(path))
 
     def restore(self, step: int, example: TrainState) -> TrainState:
         """The state saved at `step`, on the first device here, whatever it was saved on.
@@ -77,9 +84,10 @@ class Checkpoints:
         try:
             args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
             saved = self._open().restore(step, args=args)["state"]
-        except (ValueError, KeyError, TypeError) as error:
-            reason = " ".join(str(error).split())[:160]
-            raise ConfigError(f"{self._path / str(step)}: not a checkpoint of this configuration: {reason}") from None
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(
+                f"{self._path / str(step)}: is damaged, or not a checkpoint of this configuration: {_reason(error)}"
+            ) from None
         return _with_keys(saved, example)
 
     def close(self) -> None:
@@ -126,6 +134,10 @@ def _lookup(values: dict[str, Any], dotted: str) -> Any:
     for part in dotted.split("."):
         values = values[part]
     return values
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:160]
 
 
 def _success(metrics: Any) -> float:
