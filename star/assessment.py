@@ -118,11 +118,11 @@ def _fitting(program: Program, env: Any, *, source: Path) -> Spec:
         here_size, trained_size = getattr(here, name), getattr(trained, name)
         if here_size != trained_size:
             raise ConfigError(
-                f"env.name: {env.name} has {words} {here_size} numbers, the agent of {source} was trained with "
+                f"env: {env.name} has {words} {here_size} numbers, the agent of {source} was trained with "
                 f"{trained_size} ({program.config.env.name})"
             )
     if here.orientation != trained.orientation:
-        raise ConfigError(f"env.name: {env.name} has another body than {program.config.env.name}, see {source}")
+        raise ConfigError(f"env: {env.name} has another body than {program.config.env.name}, see {source}")
     period = program.config.tutor.period
     if here.episode_length % period:
         raise ConfigError(

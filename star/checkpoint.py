@@ -5,6 +5,9 @@ The latest few are kept and, besides, the one with the best evaluation.
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -81,13 +84,15 @@ class Checkpoints:
         here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         shapes = jax.eval_shape(_plain, example)
         template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), shapes)
+        args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
+        hook, sys.unraisablehook = sys.unraisablehook, partial(_report, sys.unraisablehook)
         try:
-            args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
             saved = self._open().restore(step, args=args)["state"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:  # the hook stays, for reads that end after this
             raise ConfigError(
                 f"{self._path / str(step)}: is damaged, or not a checkpoint of this configuration: {_reason(error)}"
             ) from None
+        sys.unraisablehook = hook
         return _with_keys(saved, example)
 
     def close(self) -> None:
@@ -138,6 +143,12 @@ def _lookup(values: dict[str, Any], dotted: str) -> Any:
 
 def _reason(error: Exception) -> str:
     return " ".join(str(error).split())[:160]
+
+
+def _report(hook: Callable[[Any], Any], failure: Any) -> None:
+    """Tell `hook` of a failure in the background, unless it is that of a read that outlived a failed restore."""
+    if "Event loop is closed" not in str(failure.exc_value):
+        hook(failure)
 
 
 def _success(metrics: Any) -> float:

@@ -136,8 +136,9 @@ def stratified(samples: Sequence[Sequence[float]], statistic: Callable[..., Any]
         new = dict(zip(varying, samples, strict=True))
         return statistic(*(new.get(i, old) for i, old in enumerate(data)))
 
+    of_draws = statistic if len(varying) == len(data) else redrawn
     found = stats.bootstrap(
-        [data[i] for i in varying], redrawn, method="percentile", vectorized=False, rng=0, n_resamples=4999
+        [data[i] for i in varying], of_draws, method="percentile", vectorized=False, rng=0, n_resamples=4999
     )
     return middle, found.confidence_interval.low, found.confidence_interval.high
 

@@ -184,6 +184,17 @@ def test_the_example_of_the_metrics_page_runs(folder):
     assert names["curve"] == [(2, 0.5)]
 
 
+def test_the_example_of_the_evaluation_page_finds_the_worst_goal(folder):
+    (folder / "runs" / "quickstart" / "map").mkdir(parents=True)
+    goals = [{"cell": [0, 0, 4, 4], "success_any": 1.0}, {"cell": [4, 0, 8, 4], "success_any": 0.25}]
+    line = json.dumps({"per_goal": goals}) + "\n"
+    (folder / "runs/quickstart/map/evaluation.jsonl").write_text(line + "{}\n")
+    (example,) = blocks("docs/evaluation.md", "python")
+    names: dict = {}
+    exec(example, names)
+    assert names["worst"]["cell"] == [4, 0, 8, 4]
+
+
 def test_the_example_of_the_sgim_page_learns_all_three_exercises_and_asks_the_teacher():
     example, *_ = blocks("docs/sgim.md", "python")
     names: dict = {}

@@ -179,7 +179,7 @@ def test_the_command_draws_an_agent(can_draw, run, recorded, tmp_path, monkeypat
         ("ant_maze --run RUN", "its agent was trained on point_maze, not on ant_maze"),
         ("--run RUN --tutor.ppo.hidden [16]", "its checkpoint was made with tutor.ppo.hidden"),
         ("--run RUN --episode 3", "--episode: 3 is not among 0 to 2"),
-        ("--run RUN --env.name ant_maze", "env.name: ant_maze has a state of 30 numbers"),
+        ("--run RUN --env.name ant_maze", "env: ant_maze has a state of 30 numbers"),
         ("--run RUN --steps 41", "--steps: 41 is more than the 40 env steps"),
     ],
 )
