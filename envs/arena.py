@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import floor
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +99,22 @@ class Arena:
     def gates(self) -> np.ndarray:
         """Merged rectangles of the gates [n, 4]."""
         return self._merged(lambda symbol: symbol == GATE)
+
+    def cell_at(self, point: Any) -> Cell:
+        """(row, column) of the cell that holds `point` (x, y), in m."""
+        row, column = self.origin
+        return row + floor(point[1] / self.cell + 0.5), column + floor(point[0] / self.cell + 0.5)
+
+    def grid(self, parts: int) -> np.ndarray:
+        """`parts` x `parts` equal rectangles over all free cells, row by row, without those nobody can go to: [n, 4].
+
+        Kept are those whose middle is on a floor, neither in a wall nor in a block or gate, nor cut off from the start.
+        """
+        free, walked = self.free(), _walk(self)
+        xs, ys = (np.linspace(free[:, i].min(), free[:, i + 2].max(), parts + 1) for i in (0, 1))
+        whole = np.array([(xs[c], ys[r], xs[c + 1], ys[r + 1]) for r in range(parts) for c in range(parts)])
+        cells = [self.cell_at(middle) for middle in (whole[:, :2] + whole[:, 2:]) / 2]
+        return whole[[cell in walked and self.rows[cell[0]][cell[1]] in FREE + ROBOT + GOAL for cell in cells]]
 
     def _merged(self, wanted: Callable[[str], bool]) -> np.ndarray:
         left = {(r, c) for r, row in enumerate(self.rows) for c, symbol in enumerate(row) if wanted(symbol)}

@@ -1,8 +1,8 @@
-"""The shortest ways through a maze, from the centre of one cell to those of others.
+"""The shortest ways through a maze: `routes` from the centre of one cell to those of others, `distances` of any points.
 
-A way goes from a cell to one of its four neighbours that is free. Where there is no other way it goes through a gate,
+A route goes from a cell to one of its four neighbours that is free. Where there is no other it goes through a gate,
 which the body opens by going to its switch first, or pushes a block, which slides a cell ahead of the body along its
-axes and bridges the gap that it falls into. No way moves more than one block.
+axes and bridges the gap that it falls into. No route moves more than one block.
 """
 
 from __future__ import annotations
@@ -12,12 +12,17 @@ from heapq import heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import shortest_path
 
 from envs.arena import BLOCK, CHASM, FREE, GATE, GOAL, ROBOT, WALL, Arena, Cell
 from envs.tasks import Switch
 
 Point = tuple[float, float]
 
+MAX_CORNERS = 256  # of a maze in which `distances` are told
+_PINCH = 1e-3  # share of a cell that is closed where two of them touch with their corners
+_EDGE = 1e-6  # m of a wall's side that count as outside
+_AT_ONCE = 20_000  # segments looked at together
 _HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # one cell along +x, +y, -x, -y
 
 
@@ -55,6 +60,84 @@ def routes(arena: Arena, start: Cell, goals: Collection[Cell], switch: Switch | 
                 costs[there], before[there] = new, here
                 heappush(waiting, (new, there))
     return {goal: _turns(arena, _way(before, end), switches) for goal, end in found.items()}
+
+
+def distances(arena: Arena, starts: np.ndarray, ends: np.ndarray) -> np.ndarray | None:
+    """Lengths [n], in m, of the shortest ways from `starts` [n, 2] to `ends` [n, 2] around walls and gaps.
+
+    They are ways of a point, straight from corner to corner, so no body goes a shorter one; infinite where there is
+    none. None if the arena has blocks or gates, which ways depend on, or more than `MAX_CORNERS` corners.
+    """
+    corners = _corners(arena)
+    if any(arena.cells(BLOCK + GATE)) or len(corners) > MAX_CORNERS:
+        return None
+    runs = _runs(arena)
+    between = shortest_path(_straight(corners, corners, runs))
+    from_start, to_end = (_straight(points, corners, runs) for points in (starts, ends))
+    blocked = _blocked(starts, ends, runs)
+    found = np.where(blocked, np.inf, np.linalg.norm(ends - starts, axis=1))
+    for n, (first, last) in enumerate(zip(from_start, to_end, strict=True)):
+        around = first[:, None] + between + last
+        found[n] = min(found[n], around.min(initial=np.inf))
+    return found
+
+
+def _corners(arena: Arena) -> np.ndarray:
+    """The points [n, 2] where a way can turn: the corners of walls and gaps that stick out."""
+    solid = _solid(arena)
+    around = solid[:-1, :-1] + 0 + solid[1:, :-1] + solid[:-1, 1:] + solid[1:, 1:]
+    row, column = arena.origin
+    where = np.argwhere(around == 1)[:, ::-1] + 0.5 - (column, row)
+    return where * arena.cell
+
+
+def _solid(arena: Arena) -> np.ndarray:
+    """Which cells nobody walks through (bool)."""
+    return np.array([[symbol in WALL + CHASM for symbol in line] for line in arena.rows])
+
+
+def _runs(arena: Arena) -> np.ndarray:
+    """Rectangles [n, 4] of solid cells that follow one another, along rows and along columns.
+
+    Both, so that a segment along the seam of two rectangles is inside of another one. Where two solid cells touch with
+    their corners only, which lets nobody through, there is a tiny one.
+    """
+    solid = _solid(arena)
+    row, column = arena.origin
+    crossed = (
+        (solid[:-1, :-1] == solid[1:, 1:]) & (solid[1:, :-1] == solid[:-1, 1:]) & (solid[:-1, :-1] != solid[1:, :-1])
+    )
+    found: list[tuple[float, ...]] = [
+        (c - _PINCH, r - _PINCH, c + _PINCH, r + _PINCH) for r, c in np.argwhere(crossed) + 1
+    ]
+    for along, lines in ((0, solid), (1, solid.T)):
+        for n, line in enumerate(lines):
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
+            for begin, end in edges.reshape(-1, 2):
+                found.append((begin, n, end, n + 1) if along == 0 else (n, begin, n + 1, end))
+    return (np.array(found) - (column, row, column, row) - 0.5) * arena.cell
+
+
+def _straight(points: np.ndarray, corners: np.ndarray, runs: np.ndarray) -> np.ndarray:
+    """Distances [n, c] from `points` to `corners`, infinite where something is in between."""
+    starts, ends = (np.broadcast_to(x, (len(points), len(corners), 2)) for x in (points[:, None], corners))
+    length = np.linalg.norm(ends - starts, axis=-1)
+    blocked = _blocked(starts.reshape(-1, 2), ends.reshape(-1, 2), runs)
+    return np.where(blocked.reshape(length.shape), np.inf, length)
+
+
+def _blocked(starts: np.ndarray, ends: np.ndarray, runs: np.ndarray) -> np.ndarray:
+    """Whether the segments from `starts` to `ends` [n, 2] go through the inside of one of `runs` (bool [n])."""
+    found = []
+    for i in range(0, len(starts), _AT_ONCE):
+        begin, way = starts[i : i + _AT_ONCE, None], (ends - starts)[i : i + _AT_ONCE, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sides = (runs[:, :2] + _EDGE - begin) / way, (runs[:, 2:] - _EDGE - begin) / way
+        inside = (begin > runs[:, :2] + _EDGE) & (begin < runs[:, 2:] - _EDGE)
+        enter = np.where(way == 0, np.where(inside, -np.inf, np.inf), np.minimum(*sides)).max(axis=-1)
+        leave = np.where(way == 0, np.where(inside, np.inf, -np.inf), np.maximum(*sides)).min(axis=-1)
+        found.append((np.maximum(enter, 0) < np.minimum(leave, 1)).any(axis=-1))
+    return np.concatenate(found) if found else np.zeros(0, bool)
 
 
 def _moves(arena: Arena, here: _Situation, switches: Collection[Cell]) -> Iterator[_Situation]:

@@ -32,9 +32,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy import stats
 
-from star.evaluation import bootstrap
+from star.evaluation import bootstrap, interquartile_mean
 from star.metrics import Journal, JsonLines
 
 ROOT = Path(__file__).parents[1]
@@ -119,11 +118,6 @@ def provenance(run: Path, commit: str | None) -> dict[str, Any]:
     """Commit (the one given, else that which the run noted), device, Python and versions of the last start of `run`."""
     noted = [row | ({"commit": commit} if commit else {}) for row in Journal.of(run).provenance.read()]
     return {key: noted[-1][key] for key in ("commit", "device", "python", "versions")}
-
-
-def interquartile_mean(values: np.ndarray) -> float:
-    """Mean of the middle half."""
-    return float(stats.trim_mean(values, 0.25))
 
 
 def table(reports: list[dict[str, Any]]) -> str:

@@ -5,6 +5,9 @@ The latest few are kept and, besides, the one with the best evaluation.
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +64,17 @@ class Checkpoints:
 
     def config(self, step: int) -> Config:
         """The configuration inside a checkpoint."""
-        saved = self._open().restore(step, args=ocp.args.Composite(config=ocp.args.JsonRestore()))["config"]
-        if saved.get("format") != FORMAT:
-            raise ConfigError(f"{self._path / str(step)}: checkpoint format {saved.get('format')} is not {FORMAT}")
-        return parse(saved["config"], source=str(self._path / str(step)))
+        path = self._path / str(step)
+        try:
+            saved = self._open().restore(step, args=ocp.args.Composite(config=ocp.args.JsonRestore()))["config"]
+            number = saved["format"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ConfigError(f"{path}: is damaged, its config cannot be read: {_reason(error)}") from None
+        if isinstance(number, int) and number > FORMAT:
+            raise ConfigError(f"{path}: checkpoint format {number} is newer than {FORMAT}, which this version reads")
+        if number != FORMAT:
+            raise ConfigError(f"{path}: checkpoint format {number} is not {FORMAT}")
+        return parse(saved["config"], source=str(path))
 
     def restore(self, step: int, example: TrainState) -> TrainState:
         """The state saved at `step`, on the first device here, whatever it was saved on.
@@ -74,12 +84,15 @@ class Checkpoints:
         here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         shapes = jax.eval_shape(_plain, example)
         template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), shapes)
+        args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
+        hook, sys.unraisablehook = sys.unraisablehook, partial(_report, sys.unraisablehook)
         try:
-            args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
             saved = self._open().restore(step, args=args)["state"]
-        except (ValueError, KeyError, TypeError) as error:
-            reason = " ".join(str(error).split())[:160]
-            raise ConfigError(f"{self._path / str(step)}: not a checkpoint of this configuration: {reason}") from None
+        except (OSError, ValueError, KeyError, TypeError) as error:  # the hook stays, for reads that end after this
+            raise ConfigError(
+                f"{self._path / str(step)}: is damaged, or not a checkpoint of this configuration: {_reason(error)}"
+            ) from None
+        sys.unraisablehook = hook
         return _with_keys(saved, example)
 
     def close(self) -> None:
@@ -126,6 +139,16 @@ def _lookup(values: dict[str, Any], dotted: str) -> Any:
     for part in dotted.split("."):
         values = values[part]
     return values
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split())[:160]
+
+
+def _report(hook: Callable[[Any], Any], failure: Any) -> None:
+    """Tell `hook` of a failure in the background, unless it is that of a read that outlived a failed restore."""
+    if "Event loop is closed" not in str(failure.exc_value):
+        hook(failure)
 
 
 def _success(metrics: Any) -> float:

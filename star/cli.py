@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from datetime import datetime
@@ -24,6 +25,7 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star train configs/ant_maze.yaml --with configs/agents/hiro.yaml   another agent on the same task
   star train --resume runs/NAME                 go on after an interrupt
   star evaluate runs/NAME                       success on test goals, with 95 % intervals
+  star evaluate runs/A runs/B --checkpoint all  every checkpoint of several runs, and how they compare
   star render point_maze --out maze.png         a picture of a task
   star render --run runs/NAME --out film.html   an episode of a trained agent
   star record runs/NAME --out demos.npz         what a trained agent can show another
@@ -36,6 +38,10 @@ _RENDER = """\
 Random actions in TASK, or with --run the greedy policy of a trained agent on test goals.
 .png and .jpg hold one picture, the end of the episode; .mp4, .gif and .html the whole of it.
 A setting of the task is given as --env.options.KEY VALUE."""
+_EVALUATE = """\
+Greedy episodes of trained agents on test goals, or on a grid of goals: success, time and way to the goal, with 95 %
+intervals; of several runs also how they compare. With --env.name or --env.options.KEY they act in another task than
+that of their training. With --goals grid, JSON and figures go to RUN/evaluation unless --out is given."""
 _RECORD = """\
 Greedy episodes of a trained agent on training goals. Those that reach the goal are written, up to the step that
 does, as demonstrations for other agents: routes, states and actions."""
@@ -92,14 +98,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--quiet", action="store_true", help="no progress")
     train.set_defaults(function=_train)
 
-    evaluate = commands.add_parser("evaluate", help="success on test goals", description=_OVERRIDES, **shape)
-    evaluate.add_argument("run", type=Path, help="run directory")
-    evaluate.add_argument("--episodes", dest="trainer.eval_episodes", metavar="N", help="episodes per seed")
-    evaluate.add_argument("--checkpoint", default="last", metavar="last|best|STEPS", help="which one (default: last)")
-    evaluate.add_argument("--evaluation-seed", type=_natural, default=0, metavar="N", help="seed of goals and starts")
-    evaluate.add_argument("--json", action="store_true", help="print JSON")
-    evaluate.set_defaults(function=_evaluate)
-
+    _add_evaluate(commands.add_parser("evaluate", help="success of trained agents", description=_EVALUATE, **shape))
     _add_render(commands.add_parser("render", help="pictures of a task or of an agent", description=_RENDER, **shape))
     _add_record(commands.add_parser("record", help="demonstrations by a trained agent", description=_RECORD, **shape))
     _add_report(commands.add_parser("report", help="runs as one HTML page", description=_REPORT, **shape))
@@ -109,6 +108,31 @@ def _parser() -> argparse.ArgumentParser:
     settings.add_argument("prefix", nargs="?", default="", help="only settings that begin so, such as tutor")
     settings.set_defaults(function=_settings)
     return parser
+
+
+def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
+    evaluate.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run, or one RUN/checkpoints/STEPS of it")
+    evaluate.add_argument(
+        "--checkpoint", default="last", metavar="last|best|all|STEPS", help="which ones of each RUN (default: last)"
+    )
+    evaluate.add_argument("--episodes", dest="trainer.eval_episodes", metavar="N", help="episodes per seed")
+    evaluate.add_argument("--evaluation-seed", type=_natural, default=0, metavar="N", help="seed of goals and starts")
+    _add_goals(evaluate)
+    evaluate.add_argument(
+        "--group", action="append", default=[], metavar="NAME=RUN,RUN", help="runs to be compared as one with others"
+    )
+    evaluate.add_argument("--json", action="store_true", help="print JSON, a line for each checkpoint")
+    evaluate.add_argument("--out", type=Path, metavar="DIR", help="write JSON and figures there")
+    evaluate.add_argument("--force", action="store_true", help="replace an evaluation that is there already")
+    evaluate.add_argument("--quiet", action="store_true", help="no progress")
+    evaluate.set_defaults(function=_evaluate)
+
+
+def _add_goals(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--goals", choices=("test", "grid"), default="test", help="of the task (default), or a grid over the maze"
+    )
+    command.add_argument("--grid", type=_count(64), metavar="N", help="the grid has N x N cells (default: 8)")
 
 
 def _add_render(render: argparse.ArgumentParser) -> None:
@@ -123,6 +147,9 @@ def _add_render(render: argparse.ArgumentParser) -> None:
     render.add_argument(
         "--envs", type=_count(25), default=1, metavar="N", help="environments side by side (default: 1)"
     )
+    render.add_argument("--episode", type=_natural, metavar="K", help="show episode K of `star evaluate` of the run")
+    render.add_argument("--episodes", dest="trainer.eval_episodes", metavar="N", help="that evaluation's --episodes")
+    _add_goals(render)
     render.add_argument("--steps", type=_natural, metavar="N", help="env steps (default: the whole episode)")
     render.add_argument("--every", type=_count(), default=2, metavar="N", help="draw every Nth env step (default: 2)")
     render.add_argument("--fps", type=_count(50), default=20, metavar="N", help="pictures a second (default: 20)")
@@ -227,48 +254,124 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
 
 def _evaluate(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
-    config = _run_config(options.run, {"env.engine": "auto"} | overrides)
+    task, others = _split_task(overrides)
+    chosen, groups = _chosen(options)
+    if not chosen:
+        raise ConfigError("star evaluate: give a RUN, or --group NAME=RUN,RUN (see star evaluate --help)")
+    configs = {run: _run_config(run, {"env.engine": "auto"} | others) for run, _ in chosen}
+    out = options.out or (chosen[0][0] / "evaluation" if options.goals == "grid" else None)
 
-    from star import trainer
+    from star import assessment
 
-    report = trainer.evaluate(config, options.run, checkpoint=options.checkpoint, seed=options.evaluation_seed)
+    exam = assessment.Exam(grid=_grid(options), seed=options.evaluation_seed, task=task)
+    if out is not None:
+        assessment.check_place(out, force=options.force)
+    targets = [assessment.Target(run, checkpoint, configs[run]) for run, checkpoint in chosen]
+    rows = assessment.evaluate(targets, exam, quiet=options.quiet)
+    comparison = assessment.compare(rows, groups) if len(groups) > 1 else None
+    written = assessment.write(out, rows, comparison) if out is not None else []
     if options.json:
-        print(json.dumps(report))
+        for line in [*rows, *([comparison] if comparison else [])]:
+            print(json.dumps(line))
         return 0
-    print(f"{report['env']} ({report['engine']}), checkpoint at {report['env_steps']:,} env steps")
-    for row in report["seeds"]:
-        print(f"seed {row['seed']}: " + _describe(row))
-    if len(report["seeds"]) > 1:
-        print("all seeds: " + _describe(report))
+
+    from star import tables
+
+    tables.show(rows, comparison, again=_again(options, overrides))
+    for path in written:
+        print(path)
     return 0
 
 
-def _describe(row: dict[str, Any]) -> str:
-    parts = [f"{row['episodes']} episodes"]
-    for name, digits in (("success_any", 3), ("success_final", 3), ("distance", 2), ("return", 1)):
-        low, high = row[f"{name}_interval"]
-        parts.append(f"{name} {row[name]:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]")
-    return "  ".join(parts)
+def _chosen(options: argparse.Namespace) -> tuple[list[tuple[Path, str]], dict[str, list[Path]]]:
+    """The (run, checkpoint) to evaluate, and the groups of runs: those given, then each other run by itself."""
+    names: dict[Path, Path] = {}
+    chosen: list[tuple[Path, str]] = []
+
+    def add(path: Path) -> Path:
+        run, checkpoint = _run_and_checkpoint(path, options.checkpoint)
+        run = names.setdefault(run.resolve(), run)
+        chosen.append((run, checkpoint))
+        return run
+
+    single = list(dict.fromkeys(add(path) for path in options.runs))
+    groups: dict[str, list[Path]] = {}
+    for text in options.group:
+        name, equals, runs = text.partition("=")
+        if not (name and equals and all(runs.split(","))):
+            raise ConfigError(f"--group: {text!r} is not of the form NAME=RUN,RUN")
+        if name in groups:
+            raise ConfigError(f"--group: {name} is given twice")
+        groups[name] = list(dict.fromkeys(add(Path(run)) for run in runs.split(",")))
+        for other, members in groups.items():
+            for run in members:
+                if other != name and run in groups[name]:
+                    raise ConfigError(f"--group: {run} is both in {other} and in {name}")
+    grouped = {run for runs in groups.values() for run in runs}
+    for run in single:
+        if run not in grouped:
+            groups[str(run)] = [run]
+    return chosen, groups
+
+
+def _run_and_checkpoint(path: Path, wanted: str) -> tuple[Path, str]:
+    """(RUN, STEPS) of a path RUN/checkpoints/STEPS, else the path as a run and what is wanted of it."""
+    if path.parent.name == "checkpoints" and path.name.isdecimal():
+        return path.parent.parent, path.name
+    return path, wanted
+
+
+def _grid(options: argparse.Namespace) -> int | None:
+    if options.goals == "test" and options.grid is not None:
+        raise ConfigError("--grid: needs --goals grid")
+    return (options.grid or 8) if options.goals == "grid" else None
+
+
+def _split_task(overrides: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The settings that send an agent to another task than its own, and the others."""
+    task = {k: v for k, v in overrides.items() if k == "env.name" or k.split(".")[:2] == ["env", "options"]}
+    return task, {k: v for k, v in overrides.items() if k not in task}
+
+
+def _again(options: argparse.Namespace, overrides: dict[str, Any]) -> str:
+    """The arguments with which `star render --episode` shows an episode of this evaluation."""
+    words = []
+    if options.evaluation_seed:
+        words += ["--evaluation-seed", str(options.evaluation_seed)]
+    if options.goals == "grid":
+        words += ["--goals", "grid", "--grid", str(_grid(options))]
+    for key, value in overrides.items():
+        name = "--episodes" if key == "trainer.eval_episodes" else f"--{key}"
+        words += [name, value if isinstance(value, str) else json.dumps(value)]
+    return shlex.join(words)
 
 
 def _render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     if options.run is None:
         if options.task is None:
             raise ConfigError("star render: give a task, or --run RUN (see star render --help)")
-        for flag in ("checkpoint", "seed"):
+        for flag in ("checkpoint", "seed", "episode", "grid"):
             if getattr(options, flag) is not None:
                 raise ConfigError(f"--{flag}: needs --run; random actions are chosen by --evaluation-seed")
         for key in overrides:
             if not key.startswith("env.") and key != "trainer.device":
                 raise ConfigError(f"--{key}: random actions take only env settings and trainer.device")
+        if options.goals == "grid":
+            raise ConfigError("--goals: grid needs --run; random actions take --env.options.goals")
+        task: dict[str, Any] = {}
         config = parse({}, overrides | {"env.name": options.task})
     else:
-        config = _run_config(options.run, {"env.engine": "auto"} | overrides)
+        if options.episode is not None and options.envs > 1:
+            raise ConfigError("--episode: shows one environment, so --envs cannot be more")
+        if options.episode is None and (options.goals == "grid" or "trainer.eval_episodes" in overrides):
+            raise ConfigError("--goals and --episodes: need --episode K, they say of which evaluation")
+        task, others = _split_task(overrides)
+        config = _run_config(options.run, {"env.engine": "auto"} | others)
         if options.task not in (None, config.env.name):
             raise ConfigError(f"{options.run}: its agent was trained on {config.env.name}, not on {options.task}")
     _check_output(options)
 
-    from star import rendering
+    from star import assessment, rendering
 
     show = rendering.Show(
         out=options.out,
@@ -286,7 +389,8 @@ def _render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
             run_dir=options.run,
             checkpoint=options.checkpoint or "last",
             agent=options.seed,
-            seed=options.evaluation_seed,
+            exam=assessment.Exam(grid=_grid(options), seed=options.evaluation_seed, task=task),
+            episode=options.episode,
             quiet=options.quiet,
         )
     )
@@ -371,6 +475,8 @@ def _refuse(overrides: dict[str, Any]) -> None:
 
 def _run_config(run_dir: Path, overrides: dict[str, Any]) -> Config:
     path = run_dir / "config.yaml"
+    if not run_dir.exists():
+        raise ConfigError(f"{run_dir}: is not a run directory, there is nothing of this name")
     if not path.is_file():
         raise ConfigError(f"{run_dir}: is not a run directory, it holds no config.yaml")
     return load(path, overrides)

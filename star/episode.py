@@ -99,14 +99,22 @@ def evaluate(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState,
 
 
 def play(
-    config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, *, record: Record | None = None, key: Array
+    config: AgentConfig,
+    spec: Spec,
+    env: VectorEnv,
+    state: TrainState,
+    *,
+    goals: Float[Array, "B k"] | None = None,
+    record: Record | None = None,
+    key: Array,
 ) -> tuple[Streams, Any]:
     """One greedy episode of every environment of `env`: the streams at its end, and what `record` kept.
 
-    The latter has the leading axis [T] of all env steps of the episode; it is None without `record`.
+    The latter has the leading axis [T] of all env steps of the episode; it is None without `record`. `goals` take the
+    place of those that the task draws; the starts stay the same.
     """
     reset_key, scan_key = jax.random.split(key)
-    streams = start(spec, env, key=reset_key)
+    streams = start(spec, env, goals=goals, key=reset_key)
     allowed = successors(config, state)
 
     def segment(streams: Streams, key: Array) -> tuple[Streams, Any]:
@@ -123,11 +131,19 @@ def play(
     return streams, jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), recorded)
 
 
-def start(spec: Spec, env: VectorEnv, *, practice: Float[Array, ""] | float = 0.0, key: Array) -> Streams:
-    """Fresh environments with their clocks at 0. A share `practice` of them is to practise."""
+def start(
+    spec: Spec,
+    env: VectorEnv,
+    *,
+    goals: Float[Array, "B k"] | None = None,
+    practice: Float[Array, ""] | float = 0.0,
+    key: Array,
+) -> Streams:
+    """Fresh environments with their clocks at 0, with `goals` if given. A share `practice` of them is to practise."""
     reset_key, practice_key = jax.random.split(key)
-    env_state = env.reset(reset_key)
-    n = env.num_envs
+    env_state, n = env.reset(reset_key), env.num_envs
+    if goals is not None:
+        env_state = env.with_goals(env_state, goals, jnp.ones(n, bool))
     nothing = jnp.zeros(n, jnp.int32)
     abstract = spec.abstract(env_state.obs)
     return Streams(

@@ -1,14 +1,38 @@
-"""Evaluation: greedy episodes on goals and seeds of their own, summarised with 95 % intervals."""
+"""Statistics of greedy episodes: of one agent, over its seeds, and between groups of runs, with 95 % intervals.
+
+The equations are in docs/evaluation.md.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
 from scipy import stats
 
 from star.episode import Episode
+
+MEASURES = ("success_any", "success_final")
+TAUS = np.linspace(0.0, 1.0, 101)  # where performance profiles are taken
+
+Scores = Mapping[str, Sequence[float]]  # of a group of runs: for each task the score of every seed of every run
+
+
+class Trials(struct.PyTreeNode):
+    """Greedy episodes and what it took to reach their goals, leading axes [E] or [S, E].
+
+    `steps` and `path` count env steps and m of the abstract position until the goal is first reached, or those of the
+    whole episode where it is not. `start` is the abstract position at the start.
+    """
+
+    episode: Episode
+    steps: Float[Array, "*E"]
+    path: Float[Array, "*E"]
+    start: Float[Array, "*E d"]
+    goal: Float[Array, "*E k"]
 
 
 def summarise(episode: Episode) -> dict[str, Any]:
@@ -35,20 +59,45 @@ def summarise(episode: Episode) -> dict[str, Any]:
     }
 
 
+def summarise_way(trials: Trials, shortest: np.ndarray | None, *, dt: float) -> dict[str, Any]:
+    """What it takes to reach the goal: `steps_to_goal`, `seconds_to_goal`, `path_length` (m), and `spl`.
+
+    The first three are means over the episodes that reach it, with Student's t intervals, None if none does. `shortest`
+    are the lengths of the shortest ways (m, infinite where there is none), like `trials.path`; without them `spl` is
+    None. `dt` is the length of an env step (s).
+    """
+    reached, steps, path = (
+        np.asarray(x, np.float64).ravel() for x in (trials.episode.success_any, trials.steps, trials.path)
+    )
+    found: dict[str, Any] = {}
+    for name, values in (("steps_to_goal", steps), ("seconds_to_goal", steps * dt), ("path_length", path)):
+        values = values[reached > 0]
+        found |= {
+            name: float(values.mean()) if len(values) else None,
+            f"{name}_interval": mean_interval(values) if len(values) else None,
+        }
+    weighted = np.empty(0) if shortest is None else weighted_success(reached, path, np.ravel(shortest))
+    return found | {
+        "spl": float(weighted.mean()) if len(weighted) else None,
+        "spl_interval": mean_interval(weighted) if len(weighted) else None,
+    }
+
+
+def weighted_success(reached: np.ndarray, path: np.ndarray, shortest: np.ndarray) -> np.ndarray:
+    """Success weighted by path length (Anderson et al. 2018) of every episode that has a shortest way at all.
+
+    1 for who goes the shortest way, 0 for who does not arrive. Who begins at the goal has nowhere to go: 1.
+    """
+    there = np.isfinite(shortest)
+    reached, path, shortest = reached[there], path[there], shortest[there]
+    longer = np.maximum(path, shortest)
+    return reached * np.divide(shortest, longer, out=np.ones_like(longer), where=shortest > 0)
+
+
 def proportion_interval(successes: int, trials: int) -> list[float]:
     """Wilson score interval of a proportion at 95 %."""
     interval = stats.binomtest(successes, trials).proportion_ci(0.95, method="wilson")
     return [float(interval.low), float(interval.high)]
-
-
-def bootstrap(values: Sequence[float], statistic: Callable[..., Any]) -> tuple[float, float, float]:
-    """The statistic of `values` with its 95 % percentile bootstrap interval; a single value is its own interval."""
-    data = np.asarray(values, float)
-    middle = float(statistic(data))
-    if len(data) < 2 or np.ptp(data) == 0:
-        return middle, middle, middle
-    found = stats.bootstrap((data,), statistic, method="percentile", vectorized=False, rng=0, n_resamples=4999)
-    return middle, float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
 def mean_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -72,3 +121,63 @@ def mean_interval(values: np.ndarray) -> list[float]:
         return [mean, mean]
     half = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
     return [mean - half, mean + half]
+
+
+def interquartile_mean(values: np.ndarray) -> float:
+    """Mean of the middle half: a quarter of the values, rounded down, is left out at either end."""
+    cut = len(values) // 4
+    return float(np.sort(values)[cut : len(values) - cut].mean())
+
+
+def bootstrap(values: Sequence[float], statistic: Callable[..., Any]) -> tuple[float, float, float]:
+    """The statistic of `values` with its 95 % percentile bootstrap interval; a single value is its own interval."""
+    middle, low, high = stratified([values], statistic)
+    return float(middle), float(low), float(high)
+
+
+def stratified(samples: Sequence[Sequence[float]], statistic: Callable[..., Any]) -> tuple[Any, Any, Any]:
+    """`statistic(*samples)`, a number or an array, with its 95 % percentile bootstrap interval.
+
+    Each sample is drawn anew from itself alone, so that every stratum (task, group) keeps its size.
+    """
+    data = [np.asarray(sample, float) for sample in samples]
+    middle = statistic(*data)
+    varying = [i for i, sample in enumerate(data) if len(sample) > 1 and np.ptp(sample) > 0]
+    if not varying:
+        return middle, middle, middle
+
+    def redrawn(*samples: np.ndarray) -> Any:
+        new = dict(zip(varying, samples, strict=True))
+        return statistic(*(new.get(i, old) for i, old in enumerate(data)))
+
+    of_draws = statistic if len(varying) == len(data) else redrawn
+    found = stats.bootstrap(
+        [data[i] for i in varying], of_draws, method="percentile", vectorized=False, rng=0, n_resamples=4999
+    )
+    return middle, found.confidence_interval.low, found.confidence_interval.high
+
+
+def pooled(scores: Scores, statistic: Callable[[np.ndarray], Any]) -> tuple[Any, Any, Any]:
+    """A statistic of the scores of all tasks together, with its interval from draws within each task."""
+    return stratified(list(scores.values()), lambda *tasks: statistic(np.concatenate(tasks)))
+
+
+def profile(values: np.ndarray) -> np.ndarray:
+    """The share of `values` above each of `TAUS`: a performance profile (Agarwal et al. 2021)."""
+    return (values[:, None] > TAUS).mean(axis=0)
+
+
+def improvement(better: Scores, than: Scores) -> tuple[float, float, float] | None:
+    """How likely a run of one group scores higher than one of another on a task that both have; ties count half.
+
+    With its interval from draws within each task and group; None if they have no task in common.
+    """
+    common = [task for task in better if task in than]
+    if not common:
+        return None
+
+    def probability(*samples: np.ndarray) -> float:
+        pairs = zip(samples[: len(common)], samples[len(common) :], strict=True)
+        return float(np.mean([(np.sign(x[:, None] - y).mean() + 1) / 2 for x, y in pairs]))
+
+    return stratified([group[task] for group in (better, than) for task in common], probability)

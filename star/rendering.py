@@ -23,12 +23,14 @@ from envs.options import EnvError
 from envs.render import FINE_SHADOWS, SHADOWS, Marks, Painter, Stage, aspect_of
 from envs.topdown import Sheet, tiled
 from envs.vector import VectorEnv
-from star import episode, trainer
+from star import assessment, episode, trainer
+from star.assessment import Exam
 from star.config import Config, ConfigError
 from star.tutor import Box
 
 MAX_ENVS = 25
 HEIGHTS = ((1, 480), (4, 320), (9, 240), (MAX_ENVS, 180))  # pixels of a tile, by the number of environments
+_TEST = Exam()
 WIDE = 16 / 9  # the shape that several tiles together come near to
 
 
@@ -82,14 +84,16 @@ def render(
     run_dir: Path | None = None,
     checkpoint: str = "last",
     agent: int | None = None,
-    seed: int = 0,
+    exam: Exam = _TEST,
+    episode: int | None = None,
     quiet: bool = False,
     console: Console | None = None,
 ) -> str:
     """Record and draw an episode; returns a line that says what was written.
 
-    With `run_dir` it is a greedy episode of its agent of seed `agent` (None: the first) on test goals, without it
-    one of random actions. `seed` chooses starts, goals and random actions.
+    With `run_dir` it is a greedy episode of its agent of seed `agent` (None: the first) in `exam`, and with `episode`
+    the one of that number in its evaluation, without it one of random actions. `exam.seed` chooses starts, goals and
+    random actions.
 
     Raises:
       ConfigError: in one line, for whatever cannot be had; nothing is written then.
@@ -98,10 +102,17 @@ def render(
         with _progress(console or Console(stderr=True), quiet) as progress:
             task = progress.add_task("recording", total=None)
             if run_dir is None:
-                recording = record_random(config, envs=show.envs, steps=show.steps, seed=seed)
+                recording = record_random(config, envs=show.envs, steps=show.steps, seed=exam.seed)
             else:
                 recording = record_run(
-                    config, run_dir, checkpoint=checkpoint, agent=agent, envs=show.envs, steps=show.steps, seed=seed
+                    config,
+                    run_dir,
+                    checkpoint=checkpoint,
+                    agent=agent,
+                    envs=show.envs,
+                    steps=show.steps,
+                    exam=exam,
+                    number=episode,
                 )
             times = moments_shown(len(recording.moments.obs), show)
             progress.update(task, description="drawing", total=len(times))
@@ -132,25 +143,57 @@ def record_random(config: Config, *, envs: int, steps: int | None, seed: int) ->
 
 
 def record_run(
-    config: Config, run_dir: Path, *, checkpoint: str, agent: int | None, envs: int, steps: int | None, seed: int
+    config: Config,
+    run_dir: Path,
+    *,
+    checkpoint: str,
+    agent: int | None,
+    envs: int,
+    steps: int | None,
+    exam: Exam = _TEST,
+    number: int | None = None,
 ) -> Recording:
-    """A greedy episode of the agent with seed `agent` in a checkpoint of `run_dir`, on test goals."""
-    program, state, key = trainer.load_agent(config, run_dir, checkpoint=checkpoint, agent=agent, seed=seed)
-    length = _length(program.spec.episode_length, steps)
-    env = trainer.make_env(program.config, "test")
-    vector, spec = VectorEnv(env, envs, auto_reset=False), program.spec
+    """Greedy episodes of the agent with seed `agent` in a checkpoint of `run_dir`: the first `envs` of `exam`.
+
+    With `number` it is this one of the episodes that `star.assessment` evaluates. All of them and all seeds are then
+    played along with it, so that every number is the same.
+    """
+    episodes = envs if number is None else config.trainer.eval_episodes
+    if number is not None and number >= episodes:
+        raise ConfigError(f"--episode: {number} is not among 0 to {episodes - 1}; see --episodes")
+    course = assessment.prepare(config, exam, episodes=episodes, source=run_dir)
+    program, env, spec = course.program, course.env, course.spec
+    length = _length(spec.episode_length, steps)
+    index = trainer.agent_number(program, run_dir, agent)
+    _, states = trainer.load_checkpoint(program, run_dir, checkpoint)
+    keys = trainer.evaluation_keys(program, exam.seed, stream=trainer.AFTERWARDS)
+    shown = slice(0, envs) if number is None else slice(number, number + 1)
+    if number is None:
+        states, keys = jax.tree.map(lambda leaf: leaf[index : index + 1], (states, keys))
+        index = 0
+    vector = VectorEnv(env, episodes, auto_reset=False)
+
+    def look(env_state: Any) -> Moments:
+        return _look(env, jax.tree.map(lambda leaf: leaf[shown], env_state))
 
     def record(env_state: Any, subgoal: jax.Array, box: Box, action: jax.Array) -> Moments:
-        aim = box.centre if state.tutor is None else spec.abstract(env_state.obs) + subgoal[..., : box.lower.shape[-1]]
-        return _look(env, env_state).replace(subgoal=aim, lower=box.lower, upper=box.upper)
+        aim = subgoal[..., : box.lower.shape[-1]] + spec.abstract(env_state.obs)
+        if not program.config.tutor.enabled:
+            aim = box.centre
+        return look(env_state).replace(subgoal=aim[shown], lower=box.lower[shown], upper=box.upper[shown])
 
     def play(agent: Any, state: Any, key: jax.Array) -> tuple[Moments, Moments]:
-        streams, moments = episode.play(agent, spec, vector, state, record=record, key=key)
-        end = _look(env, streams.env)
+        streams, moments = episode.play(agent, spec, vector, state, goals=course.goals, record=record, key=key)
+        end = look(streams.env)
         return moments, end.replace(subgoal=moments.subgoal[-1], lower=moments.lower[-1], upper=moments.upper[-1])
 
-    played = jax.device_get(jax.jit(play)(program.config.agent(), state, key))
+    def play_all(agent: Any, states: Any, keys: jax.Array) -> tuple[Moments, Moments]:
+        played = jax.vmap(lambda state, key: play(agent, state, key))(states, keys)
+        return jax.tree.map(lambda leaf: leaf[index], played)
+
+    played = jax.device_get(jax.jit(play_all)(program.config.agent(), states, keys))
     moments = jax.tree.map(lambda leaf: leaf[: length + 1], _joined(*played))
+    state = jax.tree.map(lambda leaf: leaf[index], states)
     count = int(state.abstraction.count)
     regions = np.asarray(state.abstraction.lower[:count]), np.asarray(state.abstraction.upper[:count])
     return Recording(env, moments, regions if config.commander.enabled else None)

@@ -1,4 +1,4 @@
-"""Figures of a run: the regions over the maze, as they are and as they grew, success, and what SGIM chose."""
+"""Figures of runs: the regions over the maze, as they are and as they grew, what SGIM chose, success in evaluations."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from matplotlib.patches import Rectangle
 from star import commander, episode
 from star.abstraction import locate
 from star.config import AgentConfig
+from star.evaluation import MEASURES
 from star.sgim import selection
 from star.state import TrainState
 
@@ -141,6 +142,77 @@ def sgim_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], wall
     _save(figure, path)
 
 
+def goals_figure(path: Path, *, rows: Sequence[Row]) -> None:
+    """Draw success_any over a grid of goals, for at most five checkpoints of one run, spread evenly and with the last.
+
+    `rows` are those of `star.assessment`, oldest first, with `per_goal` and `walls`.
+    """
+    kept = np.unique(np.linspace(len(rows) - 1, 0, min(len(rows), _MAX_PANELS)).round().astype(int))
+    shown = [sorted(rows, key=lambda row: row["env_steps"])[i] for i in kept]
+    figure = Figure(figsize=(4.6 * len(shown), 4.4), layout="constrained")
+    axes = list(np.atleast_1d(figure.subplots(1, len(shown))))
+    for axis, row in zip(axes, shown, strict=True):
+        draw_goals(axis, row["per_goal"], np.asarray(row["walls"]))
+        axis.set_title(f"{row['env']} at {row['env_steps'] / 1e6:.3g} M env steps")
+    share = ScalarMappable(norm=Normalize(0, 1), cmap="viridis")
+    figure.colorbar(share, ax=axes, label="success_any, by the episode's goal")
+    _save(figure, path)
+
+
+def draw_goals(axis: Axes, goals: Sequence[Row], walls: np.ndarray) -> None:
+    """The `cell` (x_low, y_low, x_high, y_high) of every goal, coloured by its success_any, over the walls."""
+    colour = ScalarMappable(norm=Normalize(0, 1), cmap="viridis")
+    for goal in goals:
+        x_low, y_low, x_high, y_high = goal["cell"]
+        axis.add_patch(
+            Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, facecolor=colour.to_rgba(goal["success_any"]))
+        )
+    _draw_walls(axis, walls)
+    axis.set_xlim(walls[:, 0].min(), walls[:, 2].max())
+    axis.set_ylim(walls[:, 1].min(), walls[:, 3].max())
+    axis.set_aspect("equal")
+    axis.set_xlabel("x")
+    axis.set_ylabel("y")
+
+
+def checkpoints_figure(path: Path, *, runs: Mapping[str, Sequence[Row]]) -> None:
+    """Draw success over the env steps of the checkpoints of each run, with 95 % intervals.
+
+    The intervals are those over seeds, or over episodes where there is one seed.
+    """
+    figure = Figure(figsize=(5.8, 4.4), layout="constrained")
+    axis = figure.subplots()
+    for number, (name, rows) in enumerate(runs.items()):
+        ordered = sorted(rows, key=lambda row: row["env_steps"])
+        steps = [row["env_steps"] for row in ordered]
+        for measure, style in zip(MEASURES, ("--", "-"), strict=True):
+            bands = [row.get(f"{measure}_seeds_interval", row[f"{measure}_interval"]) for row in ordered]
+            label = f"{name} {measure.replace('_', ' ')}"
+            axis.plot(steps, [row[measure] for row in ordered], style, marker=".", color=f"C{number}", label=label)
+            axis.fill_between(steps, *np.transpose(bands), color=f"C{number}", alpha=0.15, linewidth=0)
+    axis.set(xlabel="env steps", ylabel="success of the checkpoint", ylim=(-0.02, 1.02))
+    axis.grid(alpha=0.3)
+    axis.legend(loc="lower right", fontsize="small")
+    _save(figure, path)
+
+
+def profile_figure(path: Path, *, groups: Sequence[Row], taus: np.ndarray) -> None:
+    """Draw the performance profile of every group: the share of its seeds with a success above tau, with intervals."""
+    figure = Figure(figsize=(10.4, 4.4), layout="constrained")
+    for axis, measure in zip(figure.subplots(1, 2, sharey=True), MEASURES, strict=True):
+        for number, group in enumerate(groups):
+            found = group[measure]
+            axis.step(taus, found["profile"], where="post", color=f"C{number}", label=group["name"])
+            axis.fill_between(
+                taus, *found["profile_interval"], step="post", color=f"C{number}", alpha=0.15, linewidth=0
+            )
+        axis.set(xlabel=f"tau ({measure})", ylim=(-0.02, 1.02))
+        axis.grid(alpha=0.3)
+    axis.figure.axes[0].set_ylabel("share of seeds above tau")
+    axis.legend(loc="lower left")
+    _save(figure, path)
+
+
 def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str = "chosen") -> None:
     """The first two abstract dimensions of the regions of a row, coloured `by` one of its values, over the walls."""
     lower, upper, chosen = (np.asarray(row[key], float) for key in ("lower", "upper", by))
@@ -148,10 +220,7 @@ def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str = "chosen")
     for low, high, colour in zip(lower, upper, colours, strict=True):
         width, height = (high - low)[:2]
         axis.add_patch(Rectangle(low[:2], width, height, facecolor=colour, edgecolor="white", linewidth=1.0))
-    for x_low, y_low, x_high, y_high in walls:
-        axis.add_patch(
-            Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, facecolor="0.25", alpha=0.75, linewidth=0)
-        )
+    _draw_walls(axis, walls)
     axis.set_xlim(lower[:, 0].min(), upper[:, 0].max())
     axis.set_ylim(lower[:, 1].min(), upper[:, 1].max())
     axis.set_aspect("equal")
@@ -177,6 +246,13 @@ def draw_success(axis: Axes, rows: Sequence[Row]) -> None:
     axis.grid(alpha=0.3)
     if axis.lines:  # none before the first evaluation
         axis.legend(loc="lower right")
+
+
+def _draw_walls(axis: Axes, walls: np.ndarray) -> None:
+    for x_low, y_low, x_high, y_high in walls:
+        axis.add_patch(
+            Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, facecolor="0.25", alpha=0.75, linewidth=0)
+        )
 
 
 def _draw_panels(axes: Sequence[Axes], panels: Sequence[tuple[Row, str]], walls: np.ndarray) -> None:

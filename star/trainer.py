@@ -83,7 +83,7 @@ def build(config: Config) -> Program:
     select_device(config.trainer.device)
     env = make_env(config, "train")
     spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
-    config = _resolve(config, env.engine, spec)
+    config = resolve(config, env.engine, spec)
     try:
         states.check(config, spec)
     except ValueError as error:
@@ -139,29 +139,41 @@ def train(
         checkpoints.close()
 
 
-def evaluate(config: Config, run_dir: Path, *, checkpoint: str = "last", seed: int = 0) -> dict[str, Any]:
-    """Evaluate a checkpoint of `run_dir`: "last", "best" or its env steps. Statistics per seed and over all."""
-    program = build(config)
-    step, state = load_checkpoint(program, run_dir, checkpoint)
-    keys = evaluation_keys(program, seed, stream=AFTERWARDS)
-    episodes = jax.device_get(program.evaluate(state, keys))
-    per_seed = [
-        {"seed": name} | evaluation.summarise(jax.tree.map(lambda x, i=i: x[i], episodes))
-        for i, name in enumerate(program.seeds)
-    ]
-    about = {"run": str(run_dir), "env": config.env.name, "engine": program.config.env.engine, "env_steps": step}
-    return about | evaluation.summarise(episodes) | {"seeds": per_seed}
-
-
 def load_checkpoint(program: Program, run_dir: Path, wanted: str) -> tuple[int, TrainState]:
     """(env steps, state of all seeds) of a checkpoint of `run_dir`: "last", "best" or its env steps."""
+    with opened(run_dir) as checkpoints:
+        step = choose(checkpoints, run_dir, wanted)
+        return step, restore(program, checkpoints, step, source=run_dir)
+
+
+@contextlib.contextmanager
+def opened(run_dir: Path) -> Iterator[Checkpoints]:
+    """The checkpoints of a run, closed again at the end."""
     checkpoints = Checkpoints(run_dir)
     try:
-        step = _choose(checkpoints, run_dir, wanted)
-        check_compatible(checkpoints.config(step), program.config, source=run_dir)
-        return step, checkpoints.restore(step, jax.eval_shape(program.init, seed_keys(program)))
+        yield checkpoints
     finally:
         checkpoints.close()
+
+
+def choose(checkpoints: Checkpoints, run_dir: Path, wanted: str) -> int:
+    """Env steps of the checkpoint of `run_dir` that a user wants: "last", "best" or its env steps."""
+    steps = checkpoints.steps()
+    if not steps:
+        raise ConfigError(f"{run_dir}: holds no checkpoint")
+    if wanted == "last":
+        return steps[-1]
+    if wanted == "best":
+        return checkpoints.best()
+    if wanted.isdecimal() and int(wanted) in steps:
+        return int(wanted)
+    raise ConfigError(f"--checkpoint: {wanted!r} is not among last, best, {', '.join(map(str, steps))}")
+
+
+def restore(program: Program, checkpoints: Checkpoints, step: int, *, source: Path) -> TrainState:
+    """The state of all seeds in the checkpoint at `step`; raises `ConfigError` if it is none of `program`."""
+    check_compatible(checkpoints.config(step), program.config, source=source)
+    return checkpoints.restore(step, jax.eval_shape(program.init, seed_keys(program)))
 
 
 def load_agent(
@@ -172,13 +184,19 @@ def load_agent(
     `seed` is the one that a user chose for the evaluation.
     """
     program = build(config)
-    seeds = program.seeds
-    if agent is not None and agent not in seeds:
-        raise ConfigError(f"--seed: {agent} is not among those of {run_dir}: {', '.join(map(str, seeds))}")
-    number = 0 if agent is None else seeds.index(agent)
+    number = agent_number(program, run_dir, agent)
     _, states = load_checkpoint(program, run_dir, checkpoint)
     key = evaluation_keys(program, seed, stream=AFTERWARDS)[number]
     return program, jax.tree.map(lambda leaf: leaf[number], states), key
+
+
+def agent_number(program: Program, run_dir: Path, agent: int | None) -> int:
+    """Which of the agents of `run_dir` has the seed `agent` (None: the first)."""
+    if agent is None:
+        return 0
+    if agent not in program.seeds:
+        raise ConfigError(f"--seed: {agent} is not among those of {run_dir}: {', '.join(map(str, program.seeds))}")
+    return program.seeds.index(agent)
 
 
 def evaluation_keys(program: Program, number: int, *, stream: int = _DURING_TRAINING) -> jax.Array:
@@ -299,24 +317,10 @@ def _restore(program: Program, checkpoints: Checkpoints, journal: Journal) -> Tr
     steps, run_dir = checkpoints.steps(), journal.metrics.path.parent
     if not steps:
         raise ConfigError(f"{run_dir}: holds no checkpoint to resume from")
-    check_compatible(checkpoints.config(steps[-1]), program.config, source=run_dir)
-    state = checkpoints.restore(steps[-1], jax.eval_shape(program.init, seed_keys(program)))
+    state = restore(program, checkpoints, steps[-1], source=run_dir)
     for lines in (journal.metrics, journal.regions):
         lines.keep_until(steps[-1])
     return state
-
-
-def _choose(checkpoints: Checkpoints, run_dir: Path, wanted: str) -> int:
-    steps = checkpoints.steps()
-    if not steps:
-        raise ConfigError(f"{run_dir}: holds no checkpoint")
-    if wanted == "last":
-        return steps[-1]
-    if wanted == "best":
-        return checkpoints.best()
-    if wanted.isdigit() and int(wanted) in steps:
-        return int(wanted)
-    raise ConfigError(f"--checkpoint: {wanted!r} is not among last, best, {', '.join(map(str, steps))}")
 
 
 def _prepare(run_dir: Path, config: Config) -> None:
@@ -331,7 +335,7 @@ def _prepare(run_dir: Path, config: Config) -> None:
         raise ConfigError(f"{run_dir}: cannot be written: {error.strerror}") from None
 
 
-def _resolve(config: Config, engine: str, spec: Spec) -> Config:
+def resolve(config: Config, engine: str, spec: Spec) -> Config:
     """`config` with the engine, the map and the initial cuts that are really used."""
     values = config.model_dump(mode="json")
     values["env"]["engine"] = engine

@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,7 @@ import jax
 import pytest
 
 import envs
-from star import trainer
+from star import assessment, trainer
 from star.cli import main, split_settings
 from star.config import Config, ConfigError
 from star.loading import fields
@@ -41,22 +42,29 @@ def bare(monkeypatch):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """What `trainer.train` and `trainer.evaluate` are called with; neither does anything."""
+    """What `trainer.train` and `assessment.evaluate` are called with; neither does anything."""
     calls = []
 
     def train(config, run_dir, *, resume=False, quiet=False):
         calls.append({"config": config, "run_dir": run_dir, "resume": resume, "quiet": quiet})
         return trainer.Result(run_dir, 1_500, False, 0.25)
 
-    def evaluate(config, run_dir, *, checkpoint, seed):
-        calls.append({"config": config, "run_dir": run_dir, "checkpoint": checkpoint, "seed": seed})
-        measured = {name: 0.5 for name in ("success_any", "success_final", "distance", "return")}
-        row = {"episodes": 8} | measured | {f"{name}_interval": [0.25, 0.75] for name in measured}
-        return {"env": "point_maze", "engine": "jax", "env_steps": 10} | row | {"seeds": [{"seed": 3} | row]}
+    def evaluate(targets, exam, *, quiet):
+        calls.append({"targets": targets, "exam": exam, "config": targets[0].config})
+        return [evaluation(str(target.run_dir), env_steps=10) for target in targets]
 
     monkeypatch.setattr(trainer, "train", train)
-    monkeypatch.setattr(trainer, "evaluate", evaluate)
+    monkeypatch.setattr(assessment, "evaluate", evaluate)
     return calls
+
+
+def evaluation(run, *, env_steps):
+    """A row as of `assessment.evaluate`."""
+    shares = {name: 0.5 for name in ("success_any", "success_final")}
+    others = dict.fromkeys(("distance", "return", "seconds_to_goal", "path_length"), 7.0) | {"spl": None}
+    row = {"episodes": 8} | shares | others | {f"{name}_interval": [0.25, 0.75] for name in shares}
+    about = {"run": run, "env": "point_maze", "options": {}, "engine": "jax", "env_steps": env_steps, "goals": "test"}
+    return about | row | {"seeds": [{"seed": 3} | row | {"failed": [2, 5, 6, 7]}]}
 
 
 def contents(folder):
@@ -102,7 +110,16 @@ def refusal(capsys, folder, arguments):
         pytest.param("train --resume runs/old --run-dir a", "--run-dir", id="resume elsewhere"),
         pytest.param("evaluate runs/new", "runs/new: is not a run directory", id="evaluate a non-run"),
         pytest.param("evaluate runs/old", "runs/old: holds no checkpoint", id="evaluate without checkpoint"),
-        pytest.param("evaluate", "required: run", id="evaluate nothing"),
+        pytest.param("evaluate", "give a RUN, or --group", id="evaluate nothing"),
+        pytest.param("evaluate runs", "runs: is not a run directory, it holds no config", id="evaluate a folder"),
+        pytest.param("evaluate runs/old/checkpoints/5", "runs/old: holds no checkpoint", id="evaluate no such steps"),
+        pytest.param("evaluate runs/old --group a=", "--group: 'a=' is not of the form", id="empty group"),
+        pytest.param("evaluate --group a=runs/old --group b=runs/old", "both in a and in b", id="two groups"),
+        pytest.param("evaluate --group a=runs/old --group a=runs/x", "--group: a is given twice", id="group twice"),
+        pytest.param("evaluate --group a=runs/x", "runs/x: is not a run directory", id="group of a non-run"),
+        pytest.param("evaluate runs/old --grid 4", "--grid: needs --goals grid", id="grid without goals"),
+        pytest.param("evaluate runs/old --goals grid --grid 65", "from 1 to 64", id="huge grid"),
+        pytest.param("evaluate runs/old --out old.png", "old.png is a file, not a folder", id="evaluate into a file"),
         pytest.param("evaluate runs/old --episodes x", "trainer.eval_episodes: 'x'", id="episodes not a number"),
         pytest.param("evaluate runs/old --evaluation-seed x", "--evaluation-seed", id="seed not a number"),
         pytest.param("render", "required: --out", id="render nothing"),
@@ -113,6 +130,10 @@ def refusal(capsys, folder, arguments):
         pytest.param("render point_maze --out old.png", "old.png: exists; replace it with --force", id="render over"),
         pytest.param("render point_maze --out a.png --seed 1", "--seed: needs --run", id="render seed without run"),
         pytest.param("render point_maze --out a.png --checkpoint best", "--checkpoint: needs --run", id="no run"),
+        pytest.param("render point_maze --out a.png --episode 1", "--episode: needs --run", id="episode of no run"),
+        pytest.param("render point_maze --out a.png --goals grid", "--goals: grid needs --run", id="grid of no run"),
+        pytest.param("render --run runs/old --out a.png --goals grid", "need --episode K", id="render only a grid"),
+        pytest.param("render --run runs/old --out a.png --episode 1 --envs 2", "so --envs", id="episodes of one"),
         pytest.param("render point_maze --out a.png --tutor.period 5", "--tutor.period: random", id="render settings"),
         pytest.param("render point_maze --out a.gif --envs 26", "from 1 to 25", id="render too many"),
         pytest.param("render point_maze --out a.gif --every 0", "from 1 to", id="render every 0th"),
@@ -250,18 +271,45 @@ def test_a_second_interrupt_ends_without_a_traceback(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_evaluate_prints_every_measure_with_its_interval(calls, capsys):
-    assert main("evaluate runs/old --episodes 7 --checkpoint best --evaluation-seed 4".split()) == 0
+def test_evaluate_prints_a_line_for_each_seed_and_how_to_watch_a_failure(calls, capsys):
+    assert (
+        main("evaluate runs/old --episodes 7 --checkpoint best --evaluation-seed 4 --env.options.cell 4".split()) == 0
+    )
     out = capsys.readouterr().out
-    assert "seed 3: 8 episodes" in out and "success_final 0.500 [0.250, 0.750]" in out
+    assert "3 8 0.500 [0.250, 0.750] 0.500 [0.250, 0.750] 7.0 7.0 - 7.00 2 5 6 ..." in " ".join(out.split())
+    again = "--run runs/old --checkpoint 10 --seed 3 --episode 2 --evaluation-seed 4 --episodes 7 --env.options.cell 4"
+    assert f"star render {again} --out failure.html" in out
     (call,) = calls
-    assert (call["run_dir"], call["checkpoint"], call["seed"]) == (Path("runs/old"), "best", 4)
-    assert call["config"].trainer.eval_episodes == 7
+    ((target,), exam) = call["targets"], call["exam"]
+    assert (target.run_dir, target.checkpoint, target.config.trainer.eval_episodes) == (Path("runs/old"), "best", 7)
+    assert (exam.seed, exam.grid, exam.task, target.config.env.options) == (4, None, {"env.options.cell": 4}, {})
 
 
-def test_evaluate_prints_json_on_request(calls, capsys):
-    assert main("evaluate runs/old --json".split()) == 0
-    assert json.loads(capsys.readouterr().out)["seeds"][0]["seed"] == 3
+def test_evaluate_prints_a_line_of_json_for_each_checkpoint_on_request(calls, capsys):
+    assert main("evaluate runs/old/checkpoints/30 runs/old --json --checkpoint all".split()) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [row["seeds"][0]["seed"] for row in rows] == [3, 3]
+    assert [(t.run_dir, t.checkpoint) for t in calls[0]["targets"]] == [
+        (Path("runs/old"), "30"),
+        (Path("runs/old"), "all"),
+    ]
+
+
+def test_evaluate_compares_groups_of_runs_and_each_other_run_by_itself(calls, folder, capsys):
+    for name in ("a", "b"):
+        shutil.copytree(folder / "runs" / "old", folder / "runs" / name)
+    assert main(f"evaluate runs/old --group ours=runs/a,{folder}/runs/b/ --out eval --json".split()) == 0
+    lines = capsys.readouterr().out.splitlines()
+    comparison = json.loads(lines[-1])
+    assert len(lines) == 4
+    assert [(group["name"], len(group["runs"])) for group in comparison["groups"]] == [("ours", 2), ("runs/old", 1)]
+    assert comparison["groups"][0]["success_any"]["scores"] == {"point_maze": [0.5, 0.5]}
+    assert [pair["success_final"] for pair in comparison["improvement"]] == [0.5, 0.5]
+    assert (folder / "eval" / "evaluation.jsonl").read_text().splitlines() == lines
+    assert {path.name for path in (folder / "eval").iterdir()} == {"evaluation.jsonl", "profile.png"}
+    assert "eval/evaluation.jsonl: exists" in refusal(capsys, folder, "evaluate runs/old --out eval".split())
+    assert main("evaluate runs/old --out eval --force --quiet".split()) == 0
+    assert {path.name for path in (folder / "eval").iterdir()} == {"evaluation.jsonl"}
 
 
 def test_evaluate_takes_the_engine_of_this_machine(calls, folder):

@@ -8,7 +8,7 @@ import jax
 import pytest
 
 from envs.tasks import TASKS
-from star import cli, record, rendering, trainer
+from star import assessment, cli, record, rendering, tables, trainer
 from star.cli import main
 from star.config import Config
 from star.loading import fields, parse
@@ -57,8 +57,9 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
-    report = {"env": "", "engine": "", "env_steps": 0, "seeds": []}
-    monkeypatch.setattr(trainer, "evaluate", lambda config, run_dir, **_: report)
+    monkeypatch.setattr(assessment, "evaluate", lambda targets, exam, **_: [])
+    monkeypatch.setattr(assessment, "compare", lambda rows, groups: None)
+    monkeypatch.setattr(tables, "show", lambda rows, comparison, **_: None)
     monkeypatch.setattr(cli, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg
     monkeypatch.setattr(rendering, "render", lambda config, show, **_: "")
     monkeypatch.setattr("star.page.write", lambda runs, out: "")
@@ -68,7 +69,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("words", STAR)
 def test_every_command_line_of_the_pages_is_accepted(words, folder):
-    for run in (word for word in words if word.startswith("runs/")):
+    for run in {run for word in words for run in re.findall(r"\bruns/[\w-]+", word)}:
         (folder / run).mkdir(parents=True)
         (folder / run / "config.yaml").write_text(Config().to_yaml())
     assert main(words[1:]) == 0
@@ -182,6 +183,17 @@ def test_the_example_of_the_metrics_page_runs(folder):
     names: dict = {}
     exec(example, names)
     assert names["curve"] == [(2, 0.5)]
+
+
+def test_the_example_of_the_evaluation_page_finds_the_worst_goal(folder):
+    (folder / "runs" / "quickstart" / "map").mkdir(parents=True)
+    goals = [{"cell": [0, 0, 4, 4], "success_any": 1.0}, {"cell": [4, 0, 8, 4], "success_any": 0.25}]
+    line = json.dumps({"per_goal": goals}) + "\n"
+    (folder / "runs/quickstart/map/evaluation.jsonl").write_text(line + "{}\n")
+    (example,) = blocks("docs/evaluation.md", "python")
+    names: dict = {}
+    exec(example, names)
+    assert names["worst"]["cell"] == [4, 0, 8, 4]
 
 
 def test_the_example_of_the_sgim_page_learns_all_three_exercises_and_asks_the_teacher():

@@ -14,7 +14,8 @@ from PIL import Image
 
 import envs
 from envs import EnvError, opengl
-from star import cli, rendering, trainer
+from star import assessment, cli, rendering
+from star.assessment import Exam, Target
 from star.config import ConfigError
 from star.loading import load, parse
 from star.rendering import Moments, Show
@@ -25,11 +26,11 @@ EPISODE = 40
 
 @pytest.fixture(scope="module")
 def recorded(run):
-    """Three environments of the second agent, and what `trainer.evaluate` says of the same episodes."""
-    config = load(run / "config.yaml")
-    recording = rendering.record_run(config, run, checkpoint="last", agent=6, envs=3, steps=None, seed=1)
-    _, row = trainer.evaluate(config, run, seed=1)["seeds"]
-    return SimpleNamespace(recording=recording, row=row)
+    """Three environments of the second agent, and what is said of the same episodes in an evaluation."""
+    config, exam = load(run / "config.yaml"), Exam(seed=1)
+    recording = rendering.record_run(config, run, checkpoint="last", agent=6, envs=3, steps=None, exam=exam)
+    (row,) = assessment.evaluate([Target(run, "last", config)], exam)
+    return SimpleNamespace(recording=recording, row=row["seeds"][1])
 
 
 def random_actions(*, seed):
@@ -160,7 +161,7 @@ def test_the_command_draws_an_agent(can_draw, run, recorded, tmp_path, monkeypat
     out = tmp_path / "agent.gif"
     arguments = f"render --run {run} --out {out} --seed 6 --checkpoint 160 --evaluation-seed 9 --envs 2 --every 10"
     assert cli.main([*arguments.split(), "--height", "60"]) == 0
-    how = {"checkpoint": "160", "agent": 6, "envs": 2, "steps": None, "seed": 9}
+    how = {"checkpoint": "160", "agent": 6, "envs": 2, "steps": None, "exam": Exam(seed=9), "number": None}
     assert asked == [("point_maze", run, how)]
     assert capsys.readouterr().out.startswith(f"{out}: 5 pictures; ")
     with Image.open(out) as film:
@@ -177,6 +178,8 @@ def test_the_command_draws_an_agent(can_draw, run, recorded, tmp_path, monkeypat
         ("--run RUN --checkpoint 7", "--checkpoint: '7' is not among last, best, 160"),
         ("ant_maze --run RUN", "its agent was trained on point_maze, not on ant_maze"),
         ("--run RUN --tutor.ppo.hidden [16]", "its checkpoint was made with tutor.ppo.hidden"),
+        ("--run RUN --episode 3", "--episode: 3 is not among 0 to 2"),
+        ("--run RUN --env.name ant_maze", "env: ant_maze has a state of 30 numbers"),
         ("--run RUN --steps 41", "--steps: 41 is more than the 40 env steps"),
     ],
 )

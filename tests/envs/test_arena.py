@@ -75,3 +75,17 @@ def test_every_ant_geom_meets_floor_and_walls_and_no_other_pair_meets():
 @pytest.mark.parametrize(("name", "value"), [("timestep", 0.01), ("iterations", 7)])
 def test_options_reach_the_model(name, value):
     assert getattr(build_model(MAZE, ant.spec(), {name: value}).opt, name) == value
+
+
+def test_a_grid_covers_the_free_cells_and_nothing_else_where_its_lines_are_those_of_cells():
+    grid = MAZE.grid(6)
+    assert len(grid) == 4 * 7  # six lines are those of the 3 x 3 cells, and those between
+    assert (grid[:, 2:] - grid[:, :2] == 4.0).all()
+    for low_x, low_y, high_x, high_y in grid:
+        assert covers(MAZE.free(), ((low_x + high_x) / 2, (low_y + high_y) / 2)) == 1
+
+
+def test_a_grid_leaves_out_what_nobody_can_stand_on_or_go_to():
+    arena = Arena(rows=("11111111", "1r0#0B01", "11111111", "10000001", "11111111"), cell=2.0, block="x")
+    middles = {tuple((cell[:2] + cell[2:]) / 2) for cell in arena.grid(6)}
+    assert middles == {(0.0, -0.5), (2.0, -0.5), (0.0, 0.5), (2.0, 0.5)}

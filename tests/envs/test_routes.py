@@ -5,11 +5,11 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from envs.arena import CHASM, FREE, GOAL, ROBOT, WALL, Arena
-from envs.routes import routes
+from envs.routes import distances, routes
 from envs.tasks import TASKS, Switch
 
 EVERYWHERE = FREE + ROBOT + GOAL
@@ -153,3 +153,56 @@ def test_a_block_bridges_a_gap_that_it_falls_into(row, block, passes):
     arena = Arena(rows=("1" * len(row), row, "1" * len(row)), cell=2.0, block=block)
     end = (1, len(row) - 2)
     assert (end in routes(arena, (1, 1), [end])) == passes
+
+
+@st.composite
+def walled(draw):
+    """Small mazes with cells of 1 m, with an outline of walls."""
+    inside = draw(st.lists(st.sampled_from("0001"), min_size=12, max_size=12))
+    inside[draw(st.integers(0, 11))] = "r"
+    rows = ("".join(inside[i : i + 4]) for i in (0, 4, 8))
+    return Arena(rows=("111111", *(f"1{row}1" for row in rows), "111111"), cell=1.0)
+
+
+def seen(arena, points, others):
+    """Which of `others` are in sight of each of `points`: nowhere in between are all cells that touch it walls."""
+    row, column = arena.origin
+    walls = np.array([[symbol == WALL for symbol in line] for line in arena.rows])
+    between = points[:, None] + np.linspace(0, 1, 90)[1:-1, None, None, None] * (others - points[:, None])
+    cells = [np.floor(between + by + 0.5).astype(int) for by in itertools.product((-1e-6, 1e-6), repeat=2)]
+    return ~np.all([walls[cell[..., 1] + row, cell[..., 0] + column] for cell in cells], axis=0).any(axis=0)
+
+
+@settings(max_examples=20)
+@given(walled())
+def test_distances_are_those_of_the_shortest_ways_by_way_of_any_corners_of_cells(arena):
+    row, column = arena.origin
+    joints = [arena.rows[r][c] + arena.rows[r][c + 1] + arena.rows[r + 1][c] + arena.rows[r + 1][c + 1]
+              for r in range(4) for c in range(5)]  # fmt: skip
+    assume(not any(("1" + a + b + "1") in joints or (a + "11" + b) in joints for a in "0r" for b in "0r"))
+    centres = arena.centres(EVERYWHERE)
+    corners = np.array([(c - column - 0.5, r - row - 0.5) for r in range(1, 5) for c in range(1, 6)])
+    points = np.concatenate([centres, corners])
+    lengths = np.linalg.norm(points[:, None] - points, axis=-1)
+    shortest = np.where(seen(arena, points, points), lengths, np.inf)
+    for by in range(len(centres), len(points)):
+        shortest = np.minimum(shortest, shortest[:, by, None] + shortest[by])
+    pairs = np.array(list(itertools.product(range(len(centres)), repeat=2)))
+    found = distances(arena, *(centres[pairs[:, i]] for i in (0, 1)))
+    np.testing.assert_allclose(found, shortest[pairs[:, 0], pairs[:, 1]], atol=1e-4)
+
+
+def test_no_way_leads_between_two_walls_that_touch_with_their_corners():
+    arena = Arena(rows=("1111", "1r11", "1101", "1111"), cell=2.0)
+    assert np.isinf(distances(arena, np.zeros((1, 2)), np.full((1, 2), 2.0)))
+
+
+def test_the_distance_around_the_wall_of_the_u_goes_by_its_two_corners():
+    found = distances(TASKS["point_maze"].arena, np.zeros((2, 2)), np.array([[0.0, 16.0], [8.0, 8.0]]))
+    assert found[0] == pytest.approx(2 * math.hypot(12, 4) + 8)
+    assert np.isinf(found[1])  # that is inside the wall
+
+
+@pytest.mark.parametrize("task", ["ant_fall", "ant_push", "ant_maze_cam"])
+def test_where_blocks_and_gates_decide_no_distance_is_told(task):
+    assert distances(TASKS[task].arena, np.zeros((1, 2)), np.ones((1, 2))) is None

@@ -1,0 +1,198 @@
+"""Evaluation of several checkpoints and runs: what is played, what is said of it, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from star import assessment, cli, episode, loading, rendering, trainer
+from star.assessment import Exam, Target
+from star.checkpoint import Checkpoints
+from star.episode import Episode
+
+GRID = Exam(grid=2, seed=1)
+EPISODES = 5
+
+
+def config_of(run):
+    return loading.load(run / "config.yaml", {"trainer.eval_episodes": EPISODES})
+
+
+@pytest.fixture(scope="module")
+def still(run, tmp_path_factory):
+    """A copy of the run with another discount, other seeds and a second checkpoint, whose agents do not move."""
+    copy = tmp_path_factory.mktemp("runs") / "still"
+    copy.mkdir()
+    overrides = {"trainer.seed": 8, "commander.discount": 0.5, "trainer.eval_episodes": EPISODES}
+    program = trainer.build(loading.load(run / "config.yaml", overrides))
+    (copy / "config.yaml").write_text(program.config.to_yaml())
+    state = trainer.load_checkpoint(trainer.build(loading.load(run / "config.yaml")), run, "last")[1]
+    checkpoints = Checkpoints(copy)
+    checkpoints.save(160, state, program.config, success=1.0)
+    weak = jax.tree.map(lambda x: 0 * x, state.controller.params)
+    still = state.replace(controller=state.controller.replace(params=weak))
+    checkpoints.save(320, still, program.config, success=0.5)
+    checkpoints.close()
+    return copy
+
+
+@pytest.fixture(scope="module")
+def evaluated(run, still):
+    """The rows of both runs on a grid of goals, how often the episode was traced, and the trials of every row."""
+    traced, play, trials, row = [], episode.play, [], assessment._row
+
+    def kept(entry, exam, played, shortest):
+        trials.append(played)
+        return row(entry, exam, played, shortest)
+
+    def counted(*arguments, **how):
+        traced.append(1)
+        return play(*arguments, **how)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(episode, "play", counted)
+        patch.setattr(assessment, "_row", kept)
+        targets = [Target(run, "last", config_of(run)), Target(still, "all", config_of(still))]
+        rows = assessment.evaluate([*targets, Target(still, "best", config_of(still))], GRID)
+    return rows, len(traced), trials
+
+
+def test_all_checkpoints_of_runs_that_differ_in_numbers_and_seeds_share_one_program(evaluated, run, still):
+    rows, traced, _ = evaluated
+    assert traced == 1
+    assert [(row["run"], row["env_steps"]) for row in rows] == [(str(run), 160), (str(still), 160), (str(still), 320)]
+    assert [[seed["seed"] for seed in row["seeds"]] for row in rows] == [[5, 6], [8, 9], [8, 9]]
+
+
+def test_checkpoints_are_those_that_are_asked_for(evaluated):
+    (moving, same, still), *_ = evaluated
+    assert still["return"] != same["return"] != moving["return"]  # other seeds have other starts
+    assert still["distance"] > 10 and still["path_length"] == pytest.approx(0.0, abs=0.5)
+
+
+def test_a_grid_gives_each_goal_as_many_episodes_as_it_can_and_tells_its_success(evaluated):
+    (row, *_), *_ = evaluated
+    goals = row["per_goal"]
+    assert [goal["cell"] for goal in goals] == [
+        [-4, -4, 8, 8], [8, -4, 20, 8], [-4, 8, 8, 20], [8, 8, 20, 20]
+    ]  # fmt: skip
+    assert [goal["episodes"] for goal in goals] == [4, 2, 2, 2]
+    assert goals[0]["success_any"] == 1.0  # where the agent starts
+    total = sum(goal["episodes"] * goal["success_any"] for goal in goals)
+    assert total == pytest.approx(row["success_any"] * row["episodes"])
+
+
+def test_intervals_are_over_episodes_for_a_seed_and_over_seeds_besides(evaluated):
+    (_, _, row), *_ = evaluated
+    assert row["episodes"] == 2 * EPISODES
+    for name in ("success_any", "success_final"):
+        low, high = row[f"{name}_seeds_interval"]
+        assert low <= row[name] <= high
+        assert row["seeds"][0][f"{name}_interval"][0] < row["seeds"][0][name]
+    for seed in row["seeds"]:
+        assert len(seed["failed"]) == round(EPISODES * (1 - seed["success_any"])) > 0
+
+
+def test_the_episode_of_a_number_is_recorded_as_it_was_evaluated(evaluated, still):
+    rows, _, (_, trials, _) = evaluated
+    recorded = rendering.record_run(
+        config_of(still), still, checkpoint="160", agent=9, envs=1, steps=None, exam=GRID, number=1
+    ).moments
+    np.testing.assert_array_equal(recorded.obs[0, 0, 4:], [14, 2])
+    np.testing.assert_array_equal(recorded.obs[0, 0, :2], trials.start[1, 1])
+    assert recorded.distance[-1, 0] == trials.episode.distance[1, 1]
+    assert bool(recorded.success[1:].any()) == (1 not in rows[1]["seeds"][1]["failed"])
+
+
+def test_time_and_way_count_until_the_goal_is_first_reached():
+    rng = np.random.default_rng(0)
+    position = rng.normal(size=(7, 40, 2)).cumsum(axis=0)
+    success = (rng.random((7, 40)) < 0.15).astype(float)
+    ended = Episode.start(40)
+    found = assessment.measure(ended, jnp.asarray(position), jnp.asarray(success), goal=jnp.zeros((40, 2)))
+    for e in range(40):
+        steps, path = 0, 0.0
+        for t in range(1, 7):
+            steps, path = t, path + float(np.hypot(*(position[t, e] - position[t - 1, e])))
+            if success[t, e]:
+                break
+        assert found.steps[e] == steps and found.path[e] == pytest.approx(path, rel=1e-5)
+    np.testing.assert_allclose(found.start, position[0])
+
+
+def test_the_shortest_way_ends_where_the_goal_counts_as_reached(run):
+    course = assessment.prepare(config_of(run), Exam(), episodes=1, source=run)
+    trials = assessment.measure(Episode.start(2), jnp.zeros((2, 2, 2)), jnp.zeros((2, 2)), goal=jnp.zeros((2, 2)))
+    trials = trials.replace(goal=np.array([[0.0, 16.0], [3.0, 0.0]]))
+    np.testing.assert_allclose(assessment.shortest_ways(course, trials), [2 * np.hypot(12, 4) + 8 - 5, 0.0])
+
+
+def test_in_another_task_an_agent_keeps_its_regions_and_meets_other_goals_and_clocks(run):
+    task = {"env.name": "point_4rooms", "env.options.episode_length": 60}
+    course = assessment.prepare(config_of(run), Exam(task=task), episodes=1, source=run)
+    assert (course.env.name, course.spec.episode_length, course.options) == ("point_4rooms", 60, {"episode_length": 60})
+    assert course.spec.space == course.program.spec.space != tuple(tuple(x) for x in course.env.space)
+    assert course.spec.success_radius == 2.5
+    same = assessment.elsewhere(config_of(run), {"env.options.reward": "sparse"})
+    assert same.env.options == {"episode_length": 40, "reward": "sparse"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("--env.name ant_maze", "env: ant_maze has a state of 30 numbers, the agent of RUN was trained with 4"),
+        ("--env.name point_mase", 'task "point_mase" is unknown'),
+        ("--env.options.episode_length 45", "env.options.episode_length: 45 is not a multiple of tutor.period 10"),
+        ("--goals grid --grid 9 --episodes 20", "--grid: 9 makes 63 goals, more than the 20 episodes"),
+        ("--goals grid --grid 1", "--grid: 1 puts no goal on a free floor"),
+        ("--tutor.ppo.hidden [16]", "its checkpoint was made with tutor.ppo.hidden"),
+        ("--checkpoint 7", "--checkpoint: '7' is not among last, best, 160"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_told_in_one_line_and_nothing_is_written(run, tmp_path, capsys, arguments, said):
+    assert cli.main(["evaluate", str(run), *arguments.split(), "--out", str(tmp_path / "new")]) == 2
+    out, err = capsys.readouterr()
+    assert said.replace("RUN", str(run)) in err and err.count("\n") == 1 and out == "" and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda path: (path / "config" / "metadata").write_text('{"format": 99}'), "format 99 is newer than"),
+        (lambda path: (path / "config" / "metadata").write_text("{"), "is damaged"),
+        (lambda path: shutil.rmtree(path / "config"), "is damaged"),
+        (lambda path: shutil.rmtree(path / "state" / "d"), "is damaged"),
+    ],
+)
+def test_a_damaged_checkpoint_is_told_in_one_line(run, tmp_path, capsys, damage, said):
+    shutil.copytree(run, tmp_path / "run")
+    damage(tmp_path / "run" / "checkpoints" / "160")
+    assert cli.main(["evaluate", str(tmp_path / "run")]) == 2
+    out, err = capsys.readouterr()
+    assert said in err and "checkpoints/160" in err and err.count("\n") == 1 and out == ""
+
+
+def test_the_folder_of_an_evaluation_holds_its_rows_and_a_figure_for_everything_in_them(evaluated, run, tmp_path):
+    rows, *_ = evaluated
+    groups = {"moving": [run], "still": [Path(rows[-1]["run"])]}
+    comparison = assessment.compare(rows, groups)
+    assert comparison["groups"][1]["success_any"]["scores"] == {
+        'point_maze {"episode_length": 40}': [seed["success_any"] for seed in rows[2]["seeds"]]
+    }
+    (tmp_path / "goals-old.png").write_text("of an earlier evaluation")
+    written = assessment.write(tmp_path, rows, comparison)
+    names = {"evaluation.jsonl", "goals-new.png", "goals-still.png", "curve.png", "profile.png"}
+    assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()} == names
+    lines = (tmp_path / "evaluation.jsonl").read_text().splitlines()
+    assert [json.loads(line) for line in lines] == [*rows, comparison]
+
+
+def test_runs_are_called_by_their_folders_unless_two_are_called_the_same():
+    runs = [Path("a/x"), Path("b/x"), Path("c/y")]
+    assert assessment.labels(runs) == ["a/x", "b/x", "y"]
