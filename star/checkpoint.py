@@ -25,6 +25,7 @@ _HARMLESS = (
     "trainer.eval_",
     "trainer.checkpoint_",
     "trainer.keep_",
+    "trainer.sinks",
 )
 
 
