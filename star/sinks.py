@@ -129,7 +129,7 @@ class WandB:
         settings = wandb.Settings(console="off", silent=True, finish_timeout=_PATIENCE_S - 5)
         offline = wandb.setup().settings.mode == "online" and not wandb.login(prompt=False, verify=False)
         if offline:
-            warn("wandb: no API key, so it works offline; upload later with: wandb sync " + str(run_dir / "wandb"))
+            warn(f"wandb: no API key, so it works offline; upload later: wandb sync {run_dir}/wandb/offline-run-*")
         self._memory = run_dir / "wandb" / "star.json"
         known = json.loads(self._memory.read_text()) if self._memory.exists() else {}
         self._id = known.get("id") or secrets.token_hex(4)
@@ -245,8 +245,7 @@ class Worker:
             finally:
                 sink.close()
         except Exception as error:  # a third party's, of any kind
-            first = error.__context__ or error  # if closing failed too
-            self._give_up(" ".join(str(first).split()) or type(first).__name__)
+            self._give_up(" ".join(str(error).split()) or type(error).__name__)
 
     def _give_up(self, reason: str) -> None:
         if not self._ended.is_set():
