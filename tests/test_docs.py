@@ -89,7 +89,7 @@ SMALL = {
     "train": """--trainer.num_envs 4 --trainer.eval_episodes 3 --trainer.eval_every 2 --env.options.episode_length 60
         --tutor.unroll 2 --tutor.ppo.hidden [8] --controller.ppo.hidden [8] --abstraction.max_regions 8
         --forward_model.hidden [8] --forward_model.batch_size 8 --forward_model.updates_per_epoch 2 --quiet
-        --refinement.depth 1 --refinement.pairs_per_epoch 1 --total-env-steps 480""",
+        --refinement.enabled false --total-env-steps 480""",
     "evaluate": "--episodes 3",
     "render": "--height 40 --steps 1",
 }
