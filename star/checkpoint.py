@@ -28,6 +28,7 @@ _HARMLESS = (
     "trainer.eval_",
     "trainer.checkpoint_",
     "trainer.keep_",
+    "trainer.sinks",
 )
 
 

@@ -48,6 +48,7 @@ does, as demonstrations for other agents: routes, states and actions."""
 _REPORT = """\
 One page with the curves of the runs over each other, how their regions grew, what they are worth to the Commander,
 the settings in which the runs differ, and films. It needs no network. A run may still be going on."""
+_MOST_PROFILED = 20  # epochs; a trace takes tens of MB for each
 _OVERRIDES = "Any setting can be overridden: --section.key VALUE (see `star settings`)."
 
 
@@ -95,6 +96,15 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--seed", dest="trainer.seed", metavar="N", help="first seed")
     train.add_argument("--seeds", dest="trainer.num_seeds", metavar="N", help="seeds trained side by side")
     train.add_argument("--total-env-steps", dest="trainer.total_env_steps", metavar="N", help="env steps per seed")
+    train.add_argument(
+        "--profile",
+        nargs="?",
+        type=_count(_MOST_PROFILED),
+        const=1,
+        default=0,
+        metavar="EPOCHS",
+        help="trace so many epochs after compilation (default: 1) with JAX's profiler, to RUN/profile",
+    )
     train.add_argument("--quiet", action="store_true", help="no progress")
     train.set_defaults(function=_train)
 
@@ -243,7 +253,9 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
     from star import trainer
 
-    result = trainer.train(config, run_dir, resume=options.resume is not None, quiet=options.quiet)
+    result = trainer.train(
+        config, run_dir, resume=options.resume is not None, quiet=options.quiet, profile=options.profile
+    )
     if result.interrupted:
         print(f"interrupted at {result.env_steps:,} env steps; go on with: star train --resume {run_dir}")
         return 130

@@ -415,6 +415,17 @@ class TrainerConfig(Section):
     checkpoint_every: Positive = Field(5, description="epochs between checkpoints")
     keep_checkpoints: Positive = Field(3, description="latest checkpoints kept, besides the best")
     device: Literal["auto", "cpu", "gpu"] = Field("auto", description="where to train")
+    sinks: tuple[Literal["tensorboard", "wandb"], ...] = Field(
+        (), description="where metrics go besides metrics.jsonl: tensorboard, wandb"
+    )
+
+    @field_validator("sinks")
+    @classmethod
+    def _sinks_differ(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        twice = next((name for i, name in enumerate(value) if name in value[:i]), None)
+        if twice:
+            raise ValueError(f"{twice} is given twice")
+        return value
 
 
 class Config(Section):

@@ -119,6 +119,7 @@ def _explain(error: ErrorDetails) -> str:
     if error["type"] == "extra_forbidden":
         return f"{key}: unknown key{_nearest_key(path)}"
     message = error["msg"].removeprefix("Value error, ").replace("Input should be", "should be")
+    message = message.replace("a valid tuple", "a list such as [a, b]")
     message = message[:1].lower() + message[1:]
     if error["type"] == "value_error" and not isinstance(error["input"], str | int | float | bool):
         return f"{key}: {message}" if key else message

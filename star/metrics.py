@@ -1,4 +1,4 @@
-"""Sinks of metrics: JSON lines on disk, and a progress bar or plain lines on the terminal."""
+"""What a run writes down: JSON lines."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
-
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from typing import Any
 
 from star.config import ConfigError
 
@@ -73,59 +70,6 @@ class Journal:
     def of(cls, run_dir: Path) -> Journal:
         """That of a run directory."""
         return cls(*(JsonLines(run_dir / f"{name}.jsonl") for name in ("metrics", "regions", "provenance")))
-
-
-class Display:
-    """What a person sees of a run: a live bar on a terminal, one line per evaluation elsewhere."""
-
-    def __init__(self, console: Console, *, total_env_steps: int, done_env_steps: int, quiet: bool = False) -> None:
-        self._console = console
-        self._total = total_env_steps
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TaskProgressColumn(),
-            TextColumn("{task.fields[status]}"),
-            TimeRemainingColumn(compact=True),
-            console=console,
-            disable=quiet or not console.is_terminal,
-        )
-        self._quiet = quiet
-        self._success: float | None = None
-        self._task = self._progress.add_task(
-            "compiling", total=total_env_steps, completed=done_env_steps, status="", start=False
-        )
-
-    def __enter__(self) -> Self:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def update(self, env_steps: int, rows: Sequence[Mapping[str, Any]], *, left_s: float) -> None:
-        """Show the rows of one epoch, one per seed."""
-        speed = rows[0]["env_steps_per_s"]
-        status = f"{speed:,.0f} env steps/s"
-        regions = mean(rows, "abstraction/regions")
-        if regions is not None:
-            status += f"  regions {regions:.0f}"
-        success = mean(rows, "eval/success_final")
-        if success is not None:
-            self._success = success
-        if self._success is not None:
-            status += f"  success {self._success:.2f}"
-        faults = sum(row.get(key, 0.0) for row in rows for key in ("env/non_finite", "env/overflow"))
-        if faults:
-            status += f"  simulator faults {faults:.0f}"
-        self._progress.start_task(self._task)
-        self._progress.update(self._task, completed=env_steps, description="training", status=status)
-        if success is not None and not self._quiet and not self._console.is_terminal:
-            self._console.print(
-                f"{env_steps:,} / {self._total:,} env steps  {status}  {left_s:.0f} s left",
-                highlight=False,
-                soft_wrap=True,
-            )
 
 
 def mean(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:

@@ -19,15 +19,18 @@ from rich.console import Console
 import envs
 from envs import arena
 from envs.vector import VectorEnv
-from star import episode, evaluation, hierarchy, provenance, report
+from star import episode, evaluation, hierarchy, profiling, provenance, report, sinks
 from star import state as states
 from star.checkpoint import Checkpoints, check_compatible
 from star.config import Config, ConfigError, TeacherConfig
+from star.display import Display, Stopwatch
 from star.episode import Episode
 from star.loading import parse
-from star.metrics import Display, Journal, mean
+from star.metrics import Journal, mean
+from star.profiling import Profile
 from star.sgim import teachers
 from star.sgim.teachers import Demonstrations
+from star.sinks import Sinks
 from star.spec import Spec
 from star.state import TrainState
 
@@ -118,13 +121,24 @@ def build(config: Config) -> Program:
 
 
 def train(
-    config: Config, run_dir: Path, *, resume: bool = False, quiet: bool = False, console: Console | None = None
+    config: Config,
+    run_dir: Path,
+    *,
+    resume: bool = False,
+    quiet: bool = False,
+    profile: int = 0,
+    console: Console | None = None,
 ) -> Result:
-    """Train to the end, or go on with the run in `run_dir`. Ctrl-C writes a checkpoint and returns."""
+    """Train to the end, or go on with the run in `run_dir`. Ctrl-C writes a checkpoint and returns.
+
+    `profile` is the number of epochs that JAX's profiler traces, to `run_dir/profile`.
+    """
     console = console or Console(stderr=True)
+    sinks.check(config)
     program = build(config)
     program.lessons()  # refused before anything is written
     checkpoints = Checkpoints(run_dir, keep=config.trainer.keep_checkpoints)
+    traced = _traced(program, checkpoints, profile) if profile else 0
     journal = Journal.of(run_dir)
     if resume:
         state = _restore(program, checkpoints, journal)
@@ -134,7 +148,9 @@ def train(
     began = int(state.epoch[0]) * program.env_steps_per_epoch
     journal.provenance.write({"env_steps": began} | provenance.here())
     try:
-        return _loop(program, state, run_dir, checkpoints, journal, quiet=quiet, console=console)
+        return _loop(
+            program, state, run_dir, checkpoints, journal, quiet=quiet, console=console, profile=(traced, profile)
+        )
     finally:
         checkpoints.close()
 
@@ -233,6 +249,7 @@ def _loop(
     *,
     quiet: bool,
     console: Console,
+    profile: tuple[int, int],
 ) -> Result:
     config, seeds = program.config.trainer, program.seeds
     rows, regions = journal.metrics.read(), journal.regions.read()
@@ -241,53 +258,96 @@ def _loop(
     began = time.monotonic() - (rows[-1]["wall_s"] if rows else 0.0)
     success = _latest_success(rows)
     saved = done if checkpoints.steps() else -1
+    stopwatch = Stopwatch()
     display = Display(
         console,
+        stopwatch,
+        title=f"{program.config.env.name} on {jax.default_backend()}, {_named(seeds)}",
         total_env_steps=program.epochs * program.env_steps_per_epoch,
         done_env_steps=env_steps,
         quiet=quiet,
     )
-    with display, _interruptible() as interrupted:
-        while done < program.epochs and not interrupted():
-            epoch_began = time.monotonic()
-            state, metrics = program.epoch(state)
-            table = _rows(metrics, seeds)
-            speed = program.env_steps_per_epoch * len(seeds) / (time.monotonic() - epoch_began)
-            done += 1
-            env_steps = done * program.env_steps_per_epoch
-            if done % config.eval_every == 0 or done == program.epochs:
-                _add_evaluation(table, program.evaluate(state, evaluation_keys(program, done)))
-                success = mean(table, "eval/success_final")
-                if program.config.commander.enabled:
-                    regions.extend(_region_rows(program, state, env_steps=env_steps))
-                    for region_row in regions[-len(seeds) :]:
-                        journal.regions.write(region_row)
-            for row in table:
-                row |= {"env_steps": env_steps, "wall_s": round(time.monotonic() - began, 3)}
-                row |= {"env_steps_per_s": round(speed)}
-                journal.metrics.write(row)
-            rows.extend(table)
-            display.update(env_steps, table, left_s=(program.epochs - done) * (time.monotonic() - epoch_began))
-            if done % config.checkpoint_every == 0 or done == program.epochs:
+    trace = Profile(run_dir / "profile", first=profile[0], epochs=profile[1], say=display.say, warn=display.warn)
+    with Sinks(run_dir, program.config, rows, warn=display.warn) as others:
+        with display, trace, _interruptible(display.stop) as interrupted:
+            while done < program.epochs and not interrupted():
+                trace.before(done)
+                with stopwatch.measure("epoch"):
+                    state, metrics = program.epoch(state)
+                    table = _rows(metrics, seeds)
+                speed = program.env_steps_per_epoch * len(seeds) / stopwatch.last("epoch")
+                done += 1
+                trace.after(done)
+                env_steps = done * program.env_steps_per_epoch
+                if done % config.eval_every == 0 or done == program.epochs:
+                    with stopwatch.measure("evaluation"):
+                        _add_evaluation(table, program.evaluate(state, evaluation_keys(program, done)))
+                    success = mean(table, "eval/success_final")
+                    if program.config.commander.enabled:
+                        regions.extend(_region_rows(program, state, env_steps=env_steps))
+                        for region_row in regions[-len(seeds) :]:
+                            journal.regions.write(region_row)
+                for row in table:
+                    row |= {"env_steps": env_steps, "wall_s": round(time.monotonic() - began, 3)}
+                    row |= {"env_steps_per_s": round(speed)}
+                    journal.metrics.write(row)
+                rows.extend(table)
+                others.write(table)
+                display.update(env_steps, table, left_s=stopwatch.left(_left(program, done)))
+                if done % config.checkpoint_every == 0 or done == program.epochs:
+                    with stopwatch.measure("checkpoint"):
+                        checkpoints.save(env_steps, state, program.config, success=_or_zero(success))
+                    saved = done
+            stopped = done < program.epochs
+            if saved != done:
                 checkpoints.save(env_steps, state, program.config, success=_or_zero(success))
-                saved = done
-        stopped = done < program.epochs
-        if saved != done:
-            checkpoints.save(env_steps, state, program.config, success=_or_zero(success))
-    if program.config.commander.enabled and not (regions and regions[-1]["env_steps"] == env_steps):
-        # stopped between evaluations
-        regions.extend(_region_rows(program, state, env_steps=env_steps))
-    report.summary_figure(run_dir / "figures" / "summary.png", regions=regions, rows=rows, walls=program.walls)
-    if regions:
-        report.growth_figure(run_dir / "figures" / "growth.png", regions=regions, walls=program.walls)
-    if rows and program.config.sgim.enabled:
-        report.sgim_figure(run_dir / "figures" / "sgim.png", regions=regions, rows=rows, walls=program.walls)
+        if program.config.commander.enabled and not (regions and regions[-1]["env_steps"] == env_steps):
+            # stopped between evaluations
+            regions.extend(_region_rows(program, state, env_steps=env_steps))
+        _draw(run_dir / "figures", program, rows, regions)
+        others.figures(run_dir / "figures")
     return Result(run_dir, env_steps, stopped, success)
 
 
 def _region_rows(program: Program, state: TrainState, *, env_steps: int) -> list[dict[str, Any]]:
     return report.region_rows(
         program.config.agent(), state, seeds=program.seeds, env_steps=env_steps, goal=program.goal
+    )
+
+
+def _draw(folder: Path, program: Program, rows: list[dict[str, Any]], regions: list[dict[str, Any]]) -> None:
+    report.summary_figure(folder / "summary.png", regions=regions, rows=rows, walls=program.walls)
+    if regions:
+        report.growth_figure(folder / "growth.png", regions=regions, walls=program.walls)
+    if rows and program.config.sgim.enabled:
+        report.sgim_figure(folder / "sgim.png", regions=regions, rows=rows, walls=program.walls)
+
+
+def _named(seeds: list[int]) -> str:
+    return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}"
+
+
+def _left(program: Program, done: int) -> dict[str, int]:
+    """How many epochs, evaluations and checkpoints follow after `done` epochs; the last epoch has both."""
+
+    def count(every: int) -> int:
+        return -(-program.epochs // every) - done // every if done < program.epochs else 0
+
+    config = program.config.trainer
+    return {
+        "epoch": program.epochs - done,
+        "evaluation": count(config.eval_every),
+        "checkpoint": count(config.checkpoint_every),
+    }
+
+
+def _traced(program: Program, checkpoints: Checkpoints, epochs: int) -> int:
+    """After how many epochs the profiler begins to trace; raises `ConfigError` if the run is too short for it."""
+    return profiling.plan(
+        done=(checkpoints.steps() or [0])[-1] // program.env_steps_per_epoch,
+        total=program.epochs,
+        eval_every=program.config.trainer.eval_every,
+        epochs=epochs,
     )
 
 
@@ -382,8 +442,8 @@ def make_env(config: Config, goals: str, **others: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _interruptible() -> Iterator[Callable[[], bool]]:
-    """Yields a function that tells whether Ctrl-C was pressed; a second Ctrl-C stops at once."""
+def _interruptible(on_first: Callable[[], None]) -> Iterator[Callable[[], bool]]:
+    """Yields a function that tells whether Ctrl-C was pressed, upon which it calls `on_first`; a second one stops."""
     pressed = False
 
     def on_interrupt(number: int, frame: FrameType | None) -> None:
@@ -391,6 +451,7 @@ def _interruptible() -> Iterator[Callable[[], bool]]:
         if pressed:
             raise KeyboardInterrupt
         pressed = True
+        on_first()
 
     before = signal.signal(signal.SIGINT, on_interrupt)
     try:

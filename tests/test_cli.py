@@ -45,8 +45,8 @@ def calls(monkeypatch):
     """What `trainer.train` and `assessment.evaluate` are called with; neither does anything."""
     calls = []
 
-    def train(config, run_dir, *, resume=False, quiet=False):
-        calls.append({"config": config, "run_dir": run_dir, "resume": resume, "quiet": quiet})
+    def train(config, run_dir, *, resume, quiet, profile):
+        calls.append({"config": config, "run_dir": run_dir, "resume": resume, "quiet": quiet, "profile": profile})
         return trainer.Result(run_dir, 1_500, False, 0.25)
 
     def evaluate(targets, exam, *, quiet):
@@ -98,6 +98,11 @@ def refusal(capsys, folder, arguments):
         pytest.param("train point.yaml --seeds 0", "trainer.num_seeds: 0", id="no seeds"),
         pytest.param("train point.yaml --tutor.period 7", "not a multiple", id="periods that do not fit"),
         pytest.param("train point.yaml --tutor.period", "--tutor.period: needs a value", id="no value"),
+        pytest.param("train point.yaml --trainer.sinks tensorboard", "should be a list", id="sinks not a list"),
+        pytest.param("train point.yaml --trainer.sinks [mlflow]", "'tensorboard' or 'wandb'", id="unknown sink"),
+        pytest.param("train point.yaml --trainer.sinks [wandb,wandb]", "sinks: wandb is given twice", id="sink twice"),
+        pytest.param("train point.yaml --profile 0", "--profile: '0' is not a whole number from 1", id="profile none"),
+        pytest.param("train --profile point.yaml", "--profile: 'point.yaml' is not a whole", id="profile a file"),
         pytest.param("train point.yml", "did you mean point.yaml?", id="missing config"),
         pytest.param("train broken.yaml", "broken.yaml: line 3", id="broken config"),
         pytest.param("train point.yaml --bogus", "--bogus: unknown argument", id="unknown flag"),
@@ -212,6 +217,12 @@ def test_settings_and_flags_override_the_file(calls):
     assert (config.tutor.reward, config.env.options) == ("distance", {"a": "b"})
     assert config.trainer.num_envs == 8
     assert (call["run_dir"], call["resume"], call["quiet"]) == (Path("new"), False, True)
+
+
+@pytest.mark.parametrize(("flag", "epochs"), [([], 0), (["--profile"], 1), (["--profile", "3"], 3)])
+def test_a_profile_is_of_as_many_epochs_as_asked_for(calls, flag, epochs):
+    assert main(["train", "point.yaml", *flag]) == 0
+    assert calls[0]["profile"] == epochs
 
 
 def test_a_run_is_named_after_its_config_file_and_the_time(calls):

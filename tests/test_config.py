@@ -86,7 +86,7 @@ def test_a_key_like_no_other_lists_those_of_its_section(write):
         ("trainer: {seed: 2020-01-01}", "trainer.seed", "2020", "integer"),
         ("tutor: {reward_scale: [1]}", "tutor.reward_scale", "[1]", "number"),
         ("tutor: {relative_bounds: maybe}", "tutor.relative_bounds", "'maybe'", "boolean"),
-        ("tutor: {ppo: {hidden: 64}}", "tutor.ppo.hidden", "64", "tuple"),
+        ("tutor: {ppo: {hidden: 64}}", "tutor.ppo.hidden", "64", "list"),
         ("tutor: {ppo: {hidden: [64, x]}}", "tutor.ppo.hidden.1", "'x'", "integer"),
         ("tutor: 5", "tutor", "5", "dictionary"),
         ("tutor:", "tutor", "None", "dictionary"),

@@ -1,18 +1,23 @@
+import dataclasses
 import itertools
 import json
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import jax
 import pytest
 
+import envs
+from envs import opengl
 from envs.tasks import TASKS
 from star import assessment, cli, record, rendering, tables, trainer
 from star.cli import main
 from star.config import Config
 from star.loading import fields, parse
 
+ENDLESS = {"total_env_steps": 2**62}
 ROOT = Path(__file__).parents[1]
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("docs/*.md"))}
 PAGES["README.md"] = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -37,6 +42,11 @@ def rows(page):
     return [[first, *(cell.strip() for cell in rest.split("|"))] for first, rest in found]
 
 
+def files(page):
+    """The files that a page tells to write: {name: text}."""
+    return dict(re.findall(r'^```\w+ title="([^"]+)"\n(.*?)^```', PAGES[page], re.DOTALL | re.MULTILINE))
+
+
 def commands():
     """Every command line that begins with `star` or `make`, as (page, words); not the bare names of commands."""
     for page, text in PAGES.items():
@@ -53,9 +63,11 @@ MAKE = [one for one in COMMANDS if one.values[0][0] == "make"]
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A working directory with the shipped config files, in which no command really trains."""
+    """A working directory with the shipped config files and those of the tutorial, where no command really trains."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
+    for name, text in files("docs/tutorial.md").items():
+        (tmp_path / name).write_text(text)
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
     monkeypatch.setattr(assessment, "evaluate", lambda targets, exam, **_: [])
     monkeypatch.setattr(assessment, "compare", lambda rows, groups: None)
@@ -75,6 +87,48 @@ def test_every_command_line_of_the_pages_is_accepted(words, folder):
     assert main(words[1:]) == 0
 
 
+SMALL = {
+    "train": """--trainer.num_envs 4 --trainer.eval_episodes 3 --trainer.eval_every 2 --env.options.episode_length 60
+        --tutor.unroll 2 --tutor.ppo.hidden [8] --controller.ppo.hidden [8] --abstraction.max_regions 8
+        --forward_model.hidden [8] --forward_model.batch_size 8 --forward_model.updates_per_epoch 2 --quiet
+        --refinement.enabled false --total-env-steps 480""",
+    "evaluate": "--episodes 3",
+    "render": "--height 40 --steps 1",
+}
+
+
+def test_the_commands_of_the_tutorial_work_as_they_are_but_smaller(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(run, tmp_path / "runs" / "quickstart")  # of step 1
+    for name, text in files("docs/tutorial.md").items():
+        (tmp_path / name).write_text(text)
+    build, programs = trainer.build, {}
+
+    def shared(config):
+        """What trains, goes on and is evaluated is the same program: it is compiled once."""
+        program = build(config)
+        same = program.config.model_copy(update={"trainer": program.config.trainer.model_copy(update=ENDLESS)})
+        return dataclasses.replace(programs.setdefault(same.to_yaml(), program), config=program.config)
+
+    monkeypatch.setattr(trainer, "build", shared)
+    try:
+        opengl.backend()
+        drawn = ()
+    except envs.EnvError:
+        drawn = ("render",)
+    lines = [line for block in blocks("docs/tutorial.md", "bash") for line in block.splitlines()]
+    done = [shlex.split(line) for line in lines if line.startswith("star ") and line.split()[1] not in drawn]
+    assert len(done) == 7 - len(drawn)
+    for _, command, *words in done:
+        more = SMALL[command].split()
+        if "--resume" in words:
+            more = ["--quiet", "--total-env-steps", "960"]
+        assert main([command, *words, *more]) == 0, capsys.readouterr().err
+    steps = [json.loads(line)["env_steps"] for line in (tmp_path / "runs/mine/metrics.jsonl").read_text().splitlines()]
+    assert steps == [240, 480, 720, 960]
+    assert capsys.readouterr().out.count("seed 0: 3 episodes") == 2
+
+
 def test_the_pages_show_how_to_train_resume_evaluate_and_look_things_up():
     shown = {tuple(one.values[0][1:3]) for one in STAR}
     assert ("train", "configs/point_maze.yaml") in shown and ("train", "--resume") in shown
@@ -92,6 +146,11 @@ def test_the_readme_begins_with_its_two_commands():
     assert [line.split("#")[0].strip() for line in first.splitlines()] == ["make quickstart", "make test"]
 
 
+def slug(heading):
+    """The anchor of a heading, on the site and on GitHub."""
+    return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading).strip().lower())
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_to_files_and_headings(page):
     for target in re.findall(r"\]\(([^)\s]+)\)", PAGES[page]):
@@ -102,7 +161,7 @@ def test_links_lead_to_files_and_headings(page):
         assert path.exists(), target
         if anchor:
             text = path.read_text(encoding="utf-8")
-            headings = {re.sub(r"[^\w]+", "-", h.strip().lower()) for h in re.findall(r"^#+ (.*)$", text, re.MULTILINE)}
+            headings = {slug(h) for h in re.findall(r"^#+ (.*)$", text, re.MULTILINE)}
             assert anchor in headings | set(re.findall(r"^::: (\S+)$", text, re.MULTILINE)), target
 
 

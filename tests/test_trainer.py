@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 import json
 import math
 import os
@@ -47,6 +48,7 @@ TINY = {
         "checkpoint_every": 2,
         "num_seeds": 2,
         "keep_checkpoints": 3,
+        "sinks": ["tensorboard"],
     },
 }
 
@@ -94,8 +96,9 @@ def finished(tmp_path_factory):
 def test_a_run_leaves_config_metrics_checkpoints_and_figure(finished):
     run_dir, result = finished
     assert result.env_steps == 4 * EPOCH and not result.interrupted
-    assert {entry.name for entry in run_dir.iterdir()} == {
+    assert {entry.name.split(".out.")[0] for entry in run_dir.iterdir()} == {
         "config.yaml", "metrics.jsonl", "regions.jsonl", "provenance.jsonl", "checkpoints", "figures",
+        "events", "seed_0", "seed_1",
     }  # fmt: skip
     for name in ("summary", "growth"):
         assert (run_dir / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
@@ -162,8 +165,16 @@ def test_seeds_differ(finished):
 
 def test_two_runs_of_one_config_and_seed_write_the_same_metrics(finished, tmp_path):
     run_dir, _ = finished
-    trainer.train(tiny(), tmp_path / "again", quiet=True)
+    trainer.train(tiny(), tmp_path / "again", quiet=True, profile=1)
     assert rows(tmp_path / "again") == rows(run_dir)
+    (trace,) = tmp_path.glob("again/profile/**/*.trace.json.gz")
+    assert b"thunk" in gzip.decompress(trace.read_bytes()).lower()
+
+
+def test_a_trace_longer_than_the_run_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(ConfigError, match="^--profile: 4 epochs cannot be traced .*: 4 are left"):
+        trainer.train(tiny(), tmp_path / "run", quiet=True, profile=4)
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_interrupted_run_resumes_to_the_same_final_state_bit_for_bit(finished, tmp_path, monkeypatch):
@@ -297,10 +308,12 @@ checkpoints.close()
     checkpoints.close()
 
 
-def test_a_numeric_hyperparameter_may_change_on_resume(finished, tmp_path):
+def test_a_numeric_hyperparameter_and_the_sinks_may_change_on_resume(finished, tmp_path):
     run_dir, _ = finished
     checkpoints = Checkpoints(run_dir)
-    trainer.check_compatible(checkpoints.config(2 * EPOCH), tiny(tutor__reward_scale=3.0), source=run_dir)
+    trainer.check_compatible(
+        checkpoints.config(2 * EPOCH), tiny(tutor__reward_scale=3.0, trainer__sinks=[]), source=run_dir
+    )
     checkpoints.close()
 
 

@@ -1,0 +1,240 @@
+"""What a person sees of a run that goes on: a live view on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Self
+
+import jax
+import numpy as np
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from star.metrics import mean
+
+Row = Mapping[str, Any]
+
+_RECENT = 5  # how many of each part of a run make the estimate of the time left
+_COMPILED = ("epoch", "evaluation")
+_REDRAWN_PER_S = 2
+_WIDTH = 90  # columns at most
+_LEVELS = {
+    "commander": ("commander/reward", None, "commander/td_error"),
+    "tutor": ("tutor/reward", "tutor/actor_loss", "tutor/critic_loss"),
+    "controller": ("controller/reward", "controller/actor_loss", "controller/critic_loss"),
+    "forward model": (None, None, "forward_model/loss"),
+}
+_DEVICE_MEMORY = (("", "in_use"), ("peak_", "in_use"), ("", "limit"))
+_FAULTS = ("env/non_finite", "env/overflow")
+_SHARE = "sgim/share_"
+_BARS = "▁▂▃▄▅▆▇█"
+
+
+class Stopwatch:
+    """How long the parts of a run take: "epoch", "evaluation", "checkpoint". The first of each takes longer."""
+
+    def __init__(self, *, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._took: dict[str, list[float]] = {}
+        self._part, self._since = "", now()
+
+    @contextmanager
+    def measure(self, part: str) -> Iterator[None]:
+        """Time what is done inside."""
+        self._part, self._since = part, self._now()
+        try:
+            yield
+            self._took.setdefault(part, []).append(self._now() - self._since)
+        finally:
+            self._part = ""
+
+    def last(self, part: str) -> float:
+        """Seconds that the last of these took."""
+        return self._took[part][-1]
+
+    def compiling(self) -> float | None:
+        """Seconds since the part that compiles now began, if one does."""
+        first = self._part in _COMPILED and self._part not in self._took
+        return self._now() - self._since if first else None
+
+    def left(self, parts: Mapping[str, int]) -> float | None:
+        """Seconds that so many of each part will take, as the latest did, if that is known of the epochs.
+
+        The first of each, which may compile, says nothing of the others.
+        """
+        if len(self._took.get("epoch", ())) < 2:
+            return None
+        usual = {part: np.mean(took[1:][-_RECENT:]) for part, took in self._took.items() if len(took) > 1}
+        return float(sum(count * usual.get(part, 0.0) for part, count in parts.items()))
+
+
+class Display:
+    """A live view on a terminal, one line per evaluation elsewhere, and nothing of either with `quiet`."""
+
+    def __init__(
+        self,
+        console: Console,
+        stopwatch: Stopwatch,
+        *,
+        title: str = "",
+        total_env_steps: int,
+        done_env_steps: int,
+        quiet: bool = False,
+    ) -> None:
+        self._console, self._stopwatch, self._title, self._quiet = console, stopwatch, title, quiet
+        self._env_steps, self._total = done_env_steps, total_env_steps
+        self._rows: Sequence[Row] = ()
+        self._success: dict[str, list[float]] = {"any": [], "final": []}
+        self._left_s: float | None = None
+        self._counted_at = time.monotonic()
+        self._stopping = False
+        self._live = Live(console=console, get_renderable=self._view, refresh_per_second=_REDRAWN_PER_S)
+        self._shown = console.is_terminal and not quiet
+
+    def __enter__(self) -> Self:
+        if self._shown:
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._shown:
+            self._live.stop()
+
+    def update(self, env_steps: int, rows: Sequence[Row], *, left_s: float | None) -> None:
+        """Show the rows of one epoch, one per seed, and the seconds left if they are known."""
+        self._env_steps, self._rows, self._left_s, self._counted_at = env_steps, rows, left_s, time.monotonic()
+        for name, values in self._success.items():
+            share = mean(rows, f"eval/success_{name}")
+            if share is not None:
+                values.append(share)
+        if mean(rows, "eval/success_final") is not None and not self._quiet and not self._console.is_terminal:
+            self.say(self._line())
+
+    def say(self, line: str, *, style: str | None = None) -> None:
+        """Print one line, above the view if there is one; from any thread."""
+        self._console.print(line, style=style, highlight=False, markup=False, soft_wrap=True)
+
+    def warn(self, line: str) -> None:
+        """Print one line that is worth notice, quiet or not."""
+        self.say(f"warning: {line}", style="yellow")
+
+    def stop(self) -> None:
+        """Tell that the run ends after this epoch."""
+        self._stopping = True
+
+    def _line(self) -> str:
+        parts = [f"{self._rows[0]['env_steps_per_s']:,.0f} env steps/s"]
+        regions = mean(self._rows, "abstraction/regions")
+        if regions is not None:
+            parts.append(f"regions {regions:.0f}")
+        parts.append(f"success {self._success['final'][-1]:.2f}")
+        if faults := _faults(self._rows):
+            parts.append(f"simulator faults {faults:.0f}")
+        if self._left_s is not None:
+            parts.append(f"{self._left_s:.0f} s left")
+        return f"{self._env_steps:,} / {self._total:,} env steps  " + "  ".join(parts)
+
+    def _view(self) -> RenderableType:
+        """The view as it is now."""
+        facts = Table.grid(padding=(0, 2))
+        facts.add_column(style="dim", no_wrap=True, min_width=10)
+        facts.add_column(no_wrap=True, overflow="ellipsis")
+        for name, value in self._facts():
+            facts.add_row(name, value)
+        parts = [self._head(), Text(""), facts]
+        if self._rows:
+            parts += [Text(""), _levels(self._rows)]
+        width = min(_WIDTH, self._console.width)
+        return Panel(Group(*parts), title=self._title, title_align="left", box=box.ROUNDED, width=width)
+
+    def _head(self) -> RenderableType:
+        """What is going on, how far it is and how long it will take."""
+        seconds = self._stopwatch.compiling()
+        if self._stopping:
+            state, end = "stopping", "after this epoch"
+        elif seconds is not None:
+            state, end = "compiling", clock(seconds)
+        else:
+            state, end = "training", ""
+            if self._left_s is not None:
+                end = clock(max(self._left_s - (time.monotonic() - self._counted_at), 0.0)) + " left"
+        head = Table.grid(expand=True, padding=(0, 1))
+        head.add_column(no_wrap=True, min_width=9)
+        head.add_column(ratio=1)
+        head.add_column(no_wrap=True, justify="right")
+        bar = ProgressBar(total=self._total, completed=self._env_steps)
+        head.add_row(state, bar, f"{self._env_steps / self._total:.0%}  {end}".rstrip())
+        return head
+
+    def _facts(self) -> Iterator[tuple[str, str]]:
+        speed = f", {self._rows[0]['env_steps_per_s']:,.0f}/s" if self._rows else ""
+        yield "env steps", f"{self._env_steps:,} of {self._total:,}{speed}"
+        bars = "utf" in self._console.encoding
+        measured = [
+            f"{name} {values[-1]:.2f}" + (f" {sparkline(values)}" if bars else "")
+            for name, values in self._success.items()
+            if values
+        ]
+        if measured:
+            yield "success", "  ".join(measured)
+        regions = mean(self._rows, "abstraction/regions")
+        if regions is not None:
+            edges = mean(self._rows, "refinement/edges")
+            yield "regions", f"{regions:.0f}" + ("" if edges is None else f", {edges:.0f} edges")
+        shares = [key for row in self._rows[:1] for key in row if key.startswith(_SHARE)]
+        if shares:
+            yield "strategies", "  ".join(f"{key.removeprefix(_SHARE)} {mean(self._rows, key):.2f}" for key in shares)
+        yield "memory", memory()
+        if faults := _faults(self._rows):
+            yield "faults", f"{faults:.0f} of the simulator"
+
+
+def sparkline(shares: Sequence[float], *, width: int = 12) -> str:
+    """Values in [0, 1] as bars in the order of time, `width` of them at most, each the mean of as many values."""
+    parts = np.array_split(np.clip(np.nan_to_num(np.asarray(shares, float)), 0, 1), min(width, len(shares)))
+    return "".join(_BARS[min(int(part.mean() * len(_BARS)), len(_BARS) - 1)] for part in parts)
+
+
+def clock(seconds: float) -> str:
+    """Seconds as m:ss, or h:mm:ss from an hour on."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def memory() -> str:
+    """The memory in use: of the first device, or of this process where the device does not tell."""
+    found = jax.local_devices()[0].memory_stats() or {}
+    if "bytes_in_use" in found:
+        used, peak, limit = (found.get(f"{name}bytes_{end}", 0) / 2**30 for name, end in _DEVICE_MEMORY)
+        return f"device {used:.1f} of {limit:.1f} GiB, peak {peak:.1f}"
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return f"host {pages * os.sysconf('SC_PAGE_SIZE') / 2**30:.1f} GiB, peak {peak:.1f}"
+
+
+def _faults(rows: Sequence[Row]) -> float:
+    return sum(row.get(key, 0.0) for row in rows for key in _FAULTS)
+
+
+def _levels(rows: Sequence[Row]) -> Table:
+    """Reward and losses of the levels that there are."""
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim", pad_edge=False)
+    table.add_column("level", style="dim", no_wrap=True)
+    for name in ("reward", "actor loss", "critic loss"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for level, keys in _LEVELS.items():
+        values = [None if key is None else mean(rows, key) for key in keys]
+        if any(value is not None for value in values):
+            table.add_row(level, *("" if value is None else f"{value:.3g}" for value in values))
+    return table
