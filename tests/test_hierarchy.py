@@ -302,7 +302,6 @@ def test_the_published_learners_run_a_whole_epoch_with_a_heading_too(breaking_en
 
 
 LEVELS = {
-    "hiro": {"commander.enabled": False, "commander.period": 30},
     "gara": {"tutor.enabled": False},
     "flat": {"commander.enabled": False, "commander.period": 30, "tutor.enabled": False},
     "hrac": {"commander.enabled": False, "tutor.adjacency.enabled": True, "tutor.adjacency.hidden": [8]},
@@ -311,7 +310,7 @@ LEVELS = {
 
 @pytest.mark.parametrize("name", LEVELS)
 def test_levels_can_be_left_out(breaking_env, turning, tiny, name):
-    """HRAC with subgoals that set a heading, of which adjacency knows nothing."""
+    """HRAC is HIRO with a loss more, here with subgoals that set a heading, of which adjacency knows nothing."""
     values = loading.parse(tiny, LEVELS[name]).model_dump(mode="json")
     agent = Epoch(breaking_env, values, turning if name == "hrac" else None)
     start = agent.init(jax.random.key(0))
