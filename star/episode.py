@@ -203,11 +203,16 @@ def command(
         if config.commander.hold:
             there = (streams.env.metrics["success"] > 0) & (practice < 0)
             target = jnp.where(there, goal_region, target)
-    around_point = (target == goal_region) & (practice < 0)
+    to_point = jnp.zeros_like(practice, bool)
     if config.commander.enabled and lesson is not None:
-        lesson, waypoint, guided = strategies.impose(config.sgim, lesson, spec.abstract(obs))
-        target = jnp.where(guided, locate(waypoint), target)
-        aim, around_point = jnp.where(guided[:, None], waypoint, aim), around_point | guided
+        lesson, waypoint, to_point = strategies.impose(config.sgim, lesson, spec.abstract(obs))
+        if config.sgim.shows_subgoals:  # on a teacher's route the regions that the Commander will have to choose
+            corners = (corner[region] for corner in (state.abstraction.lower, state.abstraction.upper))
+            beyond, led = strategies.onward(lesson, spec.abstract(obs), *corners)
+            led &= strategies.guided(config.sgim, lesson)
+            target, to_point = jnp.where(led, locate(beyond), target), to_point & ~led
+        target, aim = jnp.where(to_point, locate(waypoint), target), jnp.where(to_point[:, None], waypoint, aim)
+    around_point = to_point | ((target == goal_region) & (practice < 0))
     fresh = Streams(
         env=streams.env,
         clock=streams.clock,
@@ -250,7 +255,7 @@ def choose_subgoal(
     seen = tutor.observe(config.tutor, spec.state(obs), position, streams.box)
     action = learner.act(config.tutor, state.tutor, seen, deterministic=deterministic, key=key)
     if streams.lesson is not None and config.sgim.shows_subgoals:
-        straight = jnp.clip(spec.towards(obs, streams.box.centre) / spec.scale, -1.0, 1.0)
+        straight = jnp.clip(spec.towards(obs, strategies.coming(streams.lesson)) / spec.scale, -1.0, 1.0)
         action = jnp.where(strategies.guided(config.sgim, streams.lesson)[:, None], straight, action)
     if streams.lesson is not None and "babbling" in config.sgim.strategies:
         anything = jax.random.uniform(jax.random.fold_in(key, 1), action.shape, minval=-1.0)

@@ -107,8 +107,33 @@ def impose(
     near = jnp.linalg.norm(lesson.waypoints - position[:, None], axis=-1) < config.waypoint_radius
     met = near & (order >= lesson.leg[:, None])
     leg = jnp.maximum(lesson.leg, jnp.max(jnp.where(met, order + 1, 0), axis=1))
-    coming = jnp.minimum(leg, length - 1)[:, None, None]
-    return lesson.replace(leg=leg), jnp.take_along_axis(lesson.waypoints, coming, axis=1)[:, 0], leg < length
+    lesson = lesson.replace(leg=leg)
+    return lesson, coming(lesson), leg < length
+
+
+def coming(lesson: Lesson) -> Float[Array, "B d"]:
+    """The next waypoint; the last one where all are passed."""
+    leg = jnp.minimum(lesson.leg, lesson.waypoints.shape[1] - 1)
+    return jnp.take_along_axis(lesson.waypoints, leg[:, None, None], axis=1)[:, 0]
+
+
+def onward(
+    lesson: Lesson,
+    position: Float[Array, "B d"],
+    lower: Float[Array, "B d"],
+    upper: Float[Array, "B d"],
+    *,
+    parts: int = 16,
+) -> tuple[Float[Array, "B d"], Bool[Array, "B"]]:
+    """Where the way from `position` by the waypoints to come first leaves the box, and whether it does.
+
+    It is looked for at `parts` points on each straight leg.
+    """
+    to_come = jnp.arange(lesson.waypoints.shape[1]) >= lesson.leg[:, None]
+    points = _along(position, jnp.where(to_come[..., None], lesson.waypoints, position[:, None]), parts)
+    outside = jnp.any((points < lower[:, None]) | (points >= upper[:, None]), axis=-1)
+    first = jnp.argmax(outside, axis=1)
+    return jnp.take_along_axis(points, first[:, None, None], axis=1)[:, 0], outside.any(axis=1)
 
 
 def babbles(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
@@ -131,10 +156,7 @@ def ways(
     They are given as points, `parts` on each straight leg.
     """
     weight, which = jax.lax.top_k(guided(config, lesson).astype(jnp.float32), min(most, len(start)))
-    corners = jnp.concatenate([start[which, None], lesson.waypoints[which]], axis=1)
-    share = jnp.linspace(0.0, 1.0, parts)[:, None]
-    points = corners[:, :-1, None] + share * (corners[:, 1:] - corners[:, :-1])[:, :, None]
-    return points.reshape(len(which), -1, start.shape[-1]), weight
+    return _along(start[which], lesson.waypoints[which], parts), weight
 
 
 def begin(lesson: Lesson, distance: Float[Array, "B"], *, radius: float) -> Lesson:
@@ -251,6 +273,14 @@ def _prepare(
         away=jnp.zeros(len(goal)),
         competence=jnp.full(len(goal), jnp.nan, jnp.float32),
     )
+
+
+def _along(start: Float[Array, "N d"], waypoints: Float[Array, "N L d"], parts: int) -> Float[Array, "N P d"]:
+    """Points on the way from `start` by the waypoints, `parts` on each straight leg, both its ends included."""
+    corners = jnp.concatenate([start[:, None], waypoints], axis=1)
+    share = jnp.linspace(0.0, 1.0, parts)[:, None]
+    points = corners[:, :-1, None] + share * (corners[:, 1:] - corners[:, :-1])[:, :, None]
+    return points.reshape(len(start), -1, start.shape[-1])
 
 
 def _within_budget(config: SgimConfig, state: SgimState, choice: Choice, taught: Bool[Array, "B"]) -> Choice:

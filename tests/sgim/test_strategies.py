@@ -17,7 +17,6 @@ from star.replay import Imitation, Transition
 from star.sgim import selection, strategies
 from star.sgim.teachers import Demonstrations, nearest
 from star.spec import Spec
-from star.tutor import Box
 
 B, L = 64, 3
 GUIDE = {"name": "guide", "kind": "decomposition"}
@@ -204,6 +203,24 @@ def test_waypoints_are_passed_where_the_agent_is_near():
             np.testing.assert_array_equal(coming[b], points[b, expected])
         passed += expected > leg[b]
     assert passed > 5
+
+
+def test_a_way_leaves_a_region_where_one_who_walks_it_first_does():
+    config = settings(teachers=[GUIDE])
+    rng = np.random.default_rng(1)
+    position, points = rng.uniform(0, 4, (B, 2)).astype(np.float32), rng.uniform(0, 4, (B, L, 2)).astype(np.float32)
+    leg = rng.integers(0, L + 1, B)
+    lower, upper = (np.floor(position / 2) * 2 + side for side in (0, 2))
+    lesson = lesson_of(config)[0].replace(waypoints=jnp.asarray(points), leg=jnp.asarray(leg))
+    found, leaves = jax.jit(lambda *known: strategies.onward(lesson, *known, parts=5))(position, lower, upper)
+    for b in range(B):
+        corners = [position[b], *points[b, leg[b] :]]
+        way = [p for a, c in zip(corners, corners[1:], strict=False) for p in np.linspace(a, c, 5, dtype=np.float32)]
+        outside = [p for p in way if ((p < lower[b]) | (p >= upper[b])).any()]
+        assert bool(leaves[b]) == bool(outside)
+        if outside:
+            np.testing.assert_allclose(found[b], outside[0], atol=1e-5)
+    assert leaves.any() and not leaves.all()
 
 
 def test_competence_is_how_much_nearer_the_first_episode_came():
@@ -435,6 +452,40 @@ def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env, monkey
     np.testing.assert_allclose(selection.competence(after.sgim)[jnp.array([15, last, last + 1])], [0.1, 0.2, 0.3])
 
 
+def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(tiny, breaking_env):
+    agent, spec = (
+        loading.parse({**tiny, "sgim": {"teachers": [GUIDE], "waypoint_radius": 0.01}}).agent(),
+        Spec.of(breaking_env.env),
+    )
+    n = breaking_env.num_envs
+    lesson = jax.tree.map(lambda x: x[:n], lesson_of(agent.sgim)[0])
+    led = np.asarray(strategies.guided(agent.sgim, lesson))
+
+    @jax.jit
+    def commanded(key, waypoints):
+        state = star.state.init(agent, spec, key=key)
+        streams = episode.start(spec, breaking_env, key=key)
+        streams = streams.replace(lesson=lesson.replace(waypoints=waypoints))
+        allowed = episode.successors(agent, state)
+        return state.abstraction, episode.command(agent, spec, state, allowed, streams, epsilon=0.0, key=key)
+
+    goal = spec.goal_point(commanded(jax.random.key(0), lesson.waypoints)[1].env.obs)
+    beside = jnp.asarray([[-0.1, 0.1], [0.3, 0.1]])[None] * jnp.ones((n, 1, 1))  # two regions on, then to the goal
+    table, after = commanded(jax.random.key(0), jnp.concatenate([beside, goal[:, None]], axis=1))
+    locate = lambda p: int(regions.locate(table, jnp.asarray(p, jnp.float32)))  # noqa: E731
+    for b in np.flatnonzero(led):
+        corners = [after.start[b], *beside[b], goal[b]]
+        way = [p for a, c in zip(corners, corners[1:], strict=False) for p in np.linspace(a, c, 16)]
+        onward = next(j for j in map(locate, way) if j != int(after.region[b]))
+        assert int(after.target[b]) == onward != int(after.goal_region[b])
+        np.testing.assert_array_equal(after.box.lower[b], table.lower[onward])
+        np.testing.assert_array_equal(after.box.upper[b], table.upper[onward])
+    _, direct = commanded(jax.random.key(0), jnp.repeat(goal[:, None], 3, axis=1) + 0.5)
+    arriving = led & (np.asarray(direct.target) == np.asarray(direct.goal_region))
+    assert arriving.any()
+    np.testing.assert_allclose(direct.box.centre[arriving], goal[arriving], atol=1e-4)  # as without a teacher
+
+
 def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_tutor_imitates_them(
     tiny, breaking_env, turning
 ):
@@ -444,12 +495,10 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
     lesson = jax.tree.map(lambda x: x[:n], lesson)
     led = np.asarray(strategies.guided(agent.sgim, lesson))
     assert led.any() and not led.all()
-    point = jnp.asarray(np.random.default_rng(0).uniform(-4, 20, (n, 2)), jnp.float32)
 
     def chosen(key, lesson):
         state = star.state.init(agent, turning, key=key)
-        streams = episode.start(turning, breaking_env, key=key)
-        streams = streams.replace(lesson=lesson, box=Box(lower=point - 1, upper=point + 1))
+        streams = episode.start(turning, breaking_env, key=key).replace(lesson=lesson)
         began = streams.env.obs
         subgoal, action = episode.choose_subgoal(agent, turning, state, streams, deterministic=False, key=key)
         after, steps = episode.rollout(
@@ -462,7 +511,7 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
     np.testing.assert_array_equal(subgoal[~led], alone[~led])
     pose, scale = np.asarray(turning.pose(obs)), np.asarray(turning.scale)
     for b in np.flatnonzero(led):
-        way = np.asarray(point[b]) - pose[b, :2]
+        way = np.asarray(lesson.waypoints[b, 0]) - pose[b, :2]
         straight = np.concatenate([way, turning.heading * way / np.linalg.norm(way) - pose[b, 2:]])
         np.testing.assert_allclose(subgoal[b], np.clip(straight, -scale, scale), atol=1e-4)
 
