@@ -63,7 +63,7 @@ def summary_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], w
     axes = list(np.atleast_1d(figure.subplots(1, len(shown) + 1)))
     _draw_panels(axes[:-1], [(row, f"regions, seed {row['seed']}") for row in shown], walls)
     draw_success(axes[-1], rows)
-    _save(figure, path)
+    save(figure, path)
 
 
 def growth_figure(
@@ -82,7 +82,7 @@ def growth_figure(
     axes = list(np.atleast_1d(figure.subplots(1, len(shown))))
     titles = [f"{len(row['chosen'])} regions at {row['env_steps'] / 1e6:.3g} M env steps" for row in shown]
     _draw_panels(axes, list(zip(shown, titles, strict=True)), walls)
-    _save(figure, path)
+    save(figure, path)
 
 
 def sgim_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], walls: np.ndarray) -> None:
@@ -110,7 +110,7 @@ def sgim_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], wall
         most = max([*last["drawn"], 1e-9])
         scale = ScalarMappable(norm=Normalize(0, most), cmap="viridis")
         figure.colorbar(scale, ax=axes[1], label=f"share of choices at {last['env_steps'] / 1e6:.3g} M env steps")
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str = "chosen") -> None:
@@ -162,6 +162,7 @@ def _draw_panels(axes: Sequence[Axes], panels: Sequence[tuple[Row, str]], walls:
         axes[0].figure.colorbar(share, ax=list(axes), label=label)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure, and the folder it is to be in."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
