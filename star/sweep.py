@@ -239,19 +239,12 @@ def run(
     database = out / "sweep.db"
     if storage is None and not database.exists() and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{out}: is not empty and holds no sweep.db to go on with; choose another --out")
-    made = not out.exists()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be written: {error.strerror}") from None
+    if storage is None:
+        _make(out)
     url = storage or f"sqlite:///{database.absolute()}"
     with reachable(url):
-        try:
-            ledger = open_ledger(found, url)
-        except BaseException:
-            if made:  # nothing is left of what was refused
-                out.rmdir()
-            raise
+        ledger = open_ledger(found, url)
+        _make(out)
         with closing(ledger):
             finished = work(found, ledger, quiet=quiet, console=console)
             trials, shares = ledger.trials(), sweep_report.importance(ledger.study)
@@ -262,6 +255,13 @@ def run(
         text = found.config(trials[rows.index(best)].params).to_yaml()
         sweep_report.replace(out / "best.yaml", lambda path: path.write_text(text, encoding="utf-8"))
     return Summary(rows, finished, best)
+
+
+def _make(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be written: {error.strerror}") from None
 
 
 def work(
