@@ -46,6 +46,7 @@ def benchmark(path: Path, alone: int, settings: dict[str, Any]) -> dict[str, Any
     """Time the commands, then the programs."""
     found = plan(path, settings=settings)
     given = [word for key, value in settings.items() for word in (f"--{key}", json.dumps(value))]
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
         drawn = [_drawn(found, number, Path(folder)) for number in range(alone)]

@@ -8,7 +8,7 @@ import jax
 import pytest
 
 from envs.tasks import TASKS
-from star import cli, record, rendering, trainer
+from star import cli, record, rendering, sweep, trainer
 from star.cli import main
 from star.config import Config
 from star.loading import fields, parse
@@ -61,6 +61,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "evaluate", lambda config, run_dir, **_: report)
     monkeypatch.setattr(cli, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg
     monkeypatch.setattr(rendering, "render", lambda config, show, **_: "")
+    monkeypatch.setattr(sweep, "run", lambda found, out, **_: sweep.Summary([], True, {"trial": 0}))
     monkeypatch.setattr(record, "record", lambda config, run_dir, out, **_: "")
     return tmp_path
 
@@ -76,7 +77,7 @@ def test_every_command_line_of_the_pages_is_accepted(words, folder):
 def test_the_pages_show_how_to_train_resume_evaluate_and_look_things_up():
     shown = {tuple(one.values[0][1:3]) for one in STAR}
     assert ("train", "configs/point_maze.yaml") in shown and ("train", "--resume") in shown
-    assert {"train", "evaluate", "render", "record", "settings", "envs"} == {words[0] for words in shown}
+    assert {"train", "sweep", "evaluate", "render", "record", "settings", "envs"} == {words[0] for words in shown}
 
 
 @pytest.mark.parametrize("words", MAKE)

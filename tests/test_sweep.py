@@ -78,12 +78,11 @@ class Stub:
 
     def __init__(self, config, slots, *, wait_s=0.0):
         self.slots, self.wait_s = slots, wait_s
-        self.runs, self.done, self.begun = {}, collections.Counter(), 0
+        self.runs, self.done = {}, dict.fromkeys(range(slots), 0)
 
     def put(self, runs):
         self.runs |= runs
         self.done |= dict.fromkeys(runs, 0)
-        self.begun += len(runs)
 
     def advance(self):
         time.sleep(self.wait_s)
@@ -148,16 +147,16 @@ def test_a_grid_tries_every_point_once_and_writes_down_which_is_best(folder, cap
     assert "4 trials by success_final" in out and "next:    star train out/best.yaml" in out
 
 
-@pytest.mark.parametrize("sampler", ["tpe", "cmaes", "random"])
+@pytest.mark.parametrize("sampler", ["tpe", "cmaes"])
 def test_samplers_stay_in_the_range_and_draw_no_trial_twice(folder, sampler):
     parameters = {
         "controller.ppo.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True},
         "tutor.ppo.passes": {"low": 1, "high": 3},
     }
-    _, ledger = finished(written(parameters=parameters, sampler=sampler, trials=13, batch=4))
+    _, ledger = finished(written(parameters=parameters, sampler=sampler, trials=7, batch=3))
     drawn = [trial.params for trial in ledger.trials()]
     rates = [one["controller.ppo.learning_rate"] for one in drawn]
-    assert len(set(rates)) == 13 and all(1e-4 <= rate <= 1e-2 for rate in rates)
+    assert len(set(rates)) == 7 and all(1e-4 <= rate <= 1e-2 for rate in rates)
     assert all(one["tutor.ppo.passes"] in (1, 2, 3) for one in drawn)
 
 
@@ -169,11 +168,11 @@ def test_the_value_is_that_at_the_end_or_the_mean_of_all_evaluations(folder, sum
 
 @pytest.mark.parametrize("pruner", ["asha", "hyperband", "median"])
 def test_pruners_stop_what_is_worse_and_the_best_goes_on(folder, pruner):
-    rates = [10 ** (-4 + index * 7 % 24 / 12) for index in range(24)]
+    rates = [10 ** (-4 + index * 5 % 12 / 6) for index in range(12)]
     parameters = {"controller.ppo.learning_rate": rates}
-    _, ledger = finished(written(parameters=parameters, pruner=pruner, batch=8))
+    _, ledger = finished(written(parameters=parameters, pruner=pruner, batch=6))
     states = collections.Counter(trial.state.name for trial in ledger.trials())
-    assert states["PRUNED"] > 0 and states["PRUNED"] + states["COMPLETE"] == 24
+    assert states["PRUNED"] > 0 and states["PRUNED"] + states["COMPLETE"] == 12
     assert ledger.study.best_params["controller.ppo.learning_rate"] == max(rates)
 
 
@@ -217,6 +216,13 @@ def test_more_trials_can_be_asked_for_later(folder):
     assert len(finished(path, trials=3)[1].trials()) == 3
     assert len(finished(path, trials=5)[1].trials()) == 5
     assert len(finished(path, trials=4)[1].trials()) == 5
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("configs/sweeps/*.yaml")), ids=lambda path: path.stem)
+def test_every_shipped_sweep_is_valid_and_trains_side_by_side(path):
+    found = plan(path)
+    ends = [{key: one.ends[end] for key, one in found.file.parameters.items()} for end in (0, -1)]
+    assert len({trainer.structure(found.config(values)) for values in ends}) == 1
 
 
 @pytest.mark.parametrize(
@@ -290,7 +296,7 @@ from test_sweep import Stub
 def worker():
     found = plan(Path("three.yaml"))
     ledger = open_ledger(found, sys.argv[1], beat_s=1, grace_s=3)
-    return 0 if work(found, ledger, make=lambda config, slots: Stub(config, slots, wait_s=0.15)) else 1
+    return 0 if work(found, ledger, make=lambda config, slots: Stub(config, slots, wait_s=0.3)) else 1
 
 pids = []
 for _ in range(int(sys.argv[2])):  # forked, because importing JAX is what takes long
@@ -304,9 +310,9 @@ print(*[os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in pids], flush
 
 
 def shared(url, *, workers):
-    """Let workers share 24 trials and kill one in the middle of its own: the ledger, and what that one held."""
+    """Let workers share 16 trials and kill one in the middle of its own: the ledger, and what that one held."""
     parameters = {"controller.ppo.learning_rate": {"low": 1e-4, "high": 1e-2}}
-    path = written(sampler="random", parameters=parameters, trials=24, batch=2)
+    path = written(sampler="random", parameters=parameters, trials=16, batch=2)
     ledger = open_ledger(plan(path), url)
     where = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-c", WORKERS.format(tests=str(ROOT / "tests")), url, str(workers)]
@@ -324,11 +330,11 @@ def shared(url, *, workers):
 
 def check_shared(ledger, held):
     trials = ledger.trials()
-    assert [trial.state.name for trial in trials] == ["COMPLETE"] * 24
-    assert len({trial.params["controller.ppo.learning_rate"] for trial in trials}) == 24
+    assert [trial.state.name for trial in trials] == ["COMPLETE"] * 16
+    assert len({trial.params["controller.ppo.learning_rate"] for trial in trials}) == 16
     everything = {trial.number: trial for trial in ledger.study.get_trials(deepcopy=False)}
     given_back = [number for number in held if everything[number].state.name == "FAIL"]
-    assert given_back and len(everything) == 24 + len(given_back)
+    assert given_back and len(everything) == 16 + len(given_back)
 
 
 def test_two_workers_on_one_sqlite_file_end_all_trials_though_one_is_killed(folder):
