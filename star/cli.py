@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import yaml
+from rich.console import Console
 
 from star.config import Config, ConfigError
 from star.loading import fields, load, parse, read_yaml
@@ -24,6 +25,7 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star train configs/ant_maze.yaml --tutor.reward distance --total-env-steps 5000000
   star train configs/ant_maze.yaml --with configs/agents/hiro.yaml   another agent on the same task
   star train --resume runs/NAME                 go on after an interrupt
+  star sweep configs/sweeps/three_values.yaml   try several values and draw what they do
   star evaluate runs/NAME                       success on test goals, with 95 % intervals
   star evaluate runs/A runs/B --checkpoint all  every checkpoint of several runs, and how they compare
   star render point_maze --out maze.png         a picture of a task
@@ -49,6 +51,10 @@ _REPORT = """\
 One page with the curves of the runs over each other, how their regions grew, what they are worth to the Commander,
 the settings in which the runs differ, and films. It needs no network. A run may still be going on."""
 _MOST_PROFILED = 20  # epochs; a trace takes tens of MB for each
+_SWEEP = """\
+Train with many settings that Optuna chooses, side by side where it can be done, and write down which are best.
+The same command with --out goes on with a sweep; with --storage it joins it from any number of machines.
+Any setting of all trials can be overridden: --section.key VALUE (see `star settings`)."""
 _OVERRIDES = "Any setting can be overridden: --section.key VALUE (see `star settings`)."
 
 
@@ -108,6 +114,7 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--quiet", action="store_true", help="no progress")
     train.set_defaults(function=_train)
 
+    _add_sweep(commands.add_parser("sweep", help="try many settings", description=_SWEEP, **shape))
     _add_evaluate(commands.add_parser("evaluate", help="success of trained agents", description=_EVALUATE, **shape))
     _add_render(commands.add_parser("render", help="pictures of a task or of an agent", description=_RENDER, **shape))
     _add_record(commands.add_parser("record", help="demonstrations by a trained agent", description=_RECORD, **shape))
@@ -143,6 +150,23 @@ def _add_goals(command: argparse.ArgumentParser) -> None:
         "--goals", choices=("test", "grid"), default="test", help="of the task (default), or a grid over the maze"
     )
     command.add_argument("--grid", type=_count(64), metavar="N", help="the grid has N x N cells (default: 8)")
+
+
+def _add_sweep(sweep: argparse.ArgumentParser) -> None:
+    sweep.add_argument("file", type=Path, help="YAML file, such as configs/sweeps/point_maze.yaml")
+    sweep.add_argument("--trials", type=_count(), metavar="N", help="trials of the study in all (default: of the file)")
+    sweep.add_argument("--batch", type=_count(), metavar="N", help="trials side by side at most (default: of the file)")
+    sweep.add_argument(
+        "--storage",
+        metavar="URL",
+        help="postgresql://USER@HOST/DATABASE (default: sweep.db in the folder of the sweep)",
+    )
+    sweep.add_argument("--study", metavar="NAME", help="name in the database (default: that of the file)")
+    sweep.add_argument(
+        "--out", type=Path, metavar="DIR", help="where to write, or what to go on with (default: sweeps/NAME-TIME)"
+    )
+    sweep.add_argument("--quiet", action="store_true", help="no progress")
+    sweep.set_defaults(function=_sweep)
 
 
 def _add_render(render: argparse.ArgumentParser) -> None:
@@ -262,6 +286,28 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     success = "" if result.success_final is None else f", success_final {result.success_final:.2f} on test goals"
     print(f"trained {result.env_steps:,} env steps{success}")
     print(f"figure:  {run_dir}/figures/summary.png\nmetrics: {run_dir}/metrics.jsonl\nnext:    star evaluate {run_dir}")
+    return 0
+
+
+def _sweep(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    from star import sweep, sweep_report
+
+    given = {"trials": options.trials, "batch": options.batch, "study": options.study}
+    found = sweep.plan(options.file, settings=overrides, **{key: x for key, x in given.items() if x is not None})
+    # workers of one study find the same folder
+    name = found.name if options.storage else f"{options.file.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+    out = options.out or Path("sweeps") / name
+    summary = sweep.run(found, out, storage=options.storage, quiet=options.quiet)
+    Console().print(sweep_report.table(summary.rows, parameters=list(found.distributions), objective=found.objective))
+    if not summary.finished:
+        again = [str(options.file), *(["--storage", "URL"] if options.storage else []), "--out", str(out)]
+        print(f"interrupted; running trials were given back; go on with: star sweep {' '.join(again)}")
+        return 130
+    print(f"trials:  {out}/trials.csv")
+    if summary.best is None:
+        print("no trial was completed")
+        return 1
+    print(f"figures: {out}/figures/\nbest:    trial {summary.best['trial']}\nnext:    star train {out}/best.yaml")
     return 0
 
 

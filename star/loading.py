@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from star.config import Config, ConfigError, Section
@@ -24,7 +24,7 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers
     """
     values: dict[str, Any] = {}
     for file in (path, *layers):
-        values = _merged(values, _read(Path(file)))
+        values = _merged(values, read_file(Path(file)))
     return parse(values, overrides, source=" with ".join(map(str, (path, *layers))))
 
 
@@ -40,7 +40,8 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
     return merged
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_file(path: Path) -> dict[str, Any]:
+    """What a YAML file with sections holds; raises `ConfigError`."""
     try:
         values = read_yaml(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -86,7 +87,28 @@ def parse(
     try:
         return Config.model_validate(nested)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {_explain(error.errors()[0])}") from None
+        raise ConfigError(f"{source}: {explain(error.errors()[0])}") from None
+
+
+def check_setting(config: Config, key: str, value: Any, *, source: str) -> None:
+    """Raise `ConfigError` if there is no setting `key`, or `value` is none of its values whatever the others are."""
+    try:
+        Config.model_validate(_with_overrides(config.model_dump(mode="json"), {key: value}))
+    except ValidationError as error:
+        for each in error.errors():
+            if each["type"] == "extra_forbidden" or ".".join(map(str, each["loc"])).startswith(key):
+                raise ConfigError(f"{source}: {explain(each)}") from None
+
+
+def kind(key: str) -> Any:
+    """The type of the setting `key`, or None if there is none or it is an option of the task."""
+    annotation: Any = Config
+    for part in key.split("."):
+        known = getattr(annotation, "model_fields", {})
+        if part not in known:
+            return None
+        annotation = known[part].annotation
+    return annotation
 
 
 def fields(section: type[Section] = Config, prefix: str = "") -> Iterator[tuple[str, Any, str]]:
@@ -112,12 +134,12 @@ def _with_overrides(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> 
     return nested
 
 
-def _explain(error: ErrorDetails) -> str:
-    """One pydantic error as one line: key, value, what is allowed."""
+def explain(error: ErrorDetails, model: type[BaseModel] = Config) -> str:
+    """One pydantic error of `model` as one line: key, value, what is allowed."""
     path = [str(part) for part in error["loc"]]
     key = ".".join(path)
     if error["type"] == "extra_forbidden":
-        return f"{key}: unknown key{_nearest_key(path)}"
+        return f"{key}: unknown key{_nearest_key(path, model)}"
     message = error["msg"].removeprefix("Value error, ").replace("Input should be", "should be")
     message = message.replace("a valid tuple", "a list such as [a, b]")
     message = message[:1].lower() + message[1:]
@@ -126,12 +148,14 @@ def _explain(error: ErrorDetails) -> str:
     return f"{key}: {_show(error['input'])} is not allowed: {message}" if key else message
 
 
-def _nearest_key(path: Sequence[str]) -> str:
+def _nearest_key(path: Sequence[str], model: type[BaseModel]) -> str:
     """` (did you mean ...?)` with the most similar valid key, looked for in the section and then everywhere."""
-    section: Any = Config
+    section: Any = model
     for part in path[:-1]:
-        # of a list of sections the index comes next
-        section = get_args(section)[0] if part.isdigit() else section.model_fields[part].annotation
+        if hasattr(section, "model_fields"):
+            section = section.model_fields[part].annotation
+        else:  # a list or a mapping of sections: next comes an index or a name
+            section = get_args(section)[-1] if not part.isdigit() else get_args(section)[0]
     matches = difflib.get_close_matches(path[-1], section.model_fields, n=1, cutoff=0.5)
     if matches:
         return f" (did you mean {'.'.join([*path[:-1], matches[0]])}?)"

@@ -92,7 +92,7 @@ def summary_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], w
     axes = list(np.atleast_1d(figure.subplots(1, len(shown) + 1)))
     _draw_panels(axes[:-1], [(row, f"regions, seed {row['seed']}") for row in shown], walls)
     draw_success(axes[-1], rows)
-    _save(figure, path)
+    save(figure, path)
 
 
 def growth_figure(
@@ -111,7 +111,7 @@ def growth_figure(
     axes = list(np.atleast_1d(figure.subplots(1, len(shown))))
     titles = [f"{len(row['chosen'])} regions at {row['env_steps'] / 1e6:.3g} M env steps" for row in shown]
     _draw_panels(axes, list(zip(shown, titles, strict=True)), walls)
-    _save(figure, path)
+    save(figure, path)
 
 
 def sgim_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], walls: np.ndarray) -> None:
@@ -139,7 +139,7 @@ def sgim_figure(path: Path, *, regions: Sequence[Row], rows: Sequence[Row], wall
         most = max([*last["drawn"], 1e-9])
         scale = ScalarMappable(norm=Normalize(0, most), cmap="viridis")
         figure.colorbar(scale, ax=axes[1], label=f"share of choices at {last['env_steps'] / 1e6:.3g} M env steps")
-    _save(figure, path)
+    save(figure, path)
 
 
 def goals_figure(path: Path, *, rows: Sequence[Row]) -> None:
@@ -156,7 +156,7 @@ def goals_figure(path: Path, *, rows: Sequence[Row]) -> None:
         axis.set_title(f"{row['env']} at {row['env_steps'] / 1e6:.3g} M env steps")
     share = ScalarMappable(norm=Normalize(0, 1), cmap="viridis")
     figure.colorbar(share, ax=axes, label="success_any, by the episode's goal")
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_goals(axis: Axes, goals: Sequence[Row], walls: np.ndarray) -> None:
@@ -193,7 +193,7 @@ def checkpoints_figure(path: Path, *, runs: Mapping[str, Sequence[Row]]) -> None
     axis.set(xlabel="env steps", ylabel="success of the checkpoint", ylim=(-0.02, 1.02))
     axis.grid(alpha=0.3)
     axis.legend(loc="lower right", fontsize="small")
-    _save(figure, path)
+    save(figure, path)
 
 
 def profile_figure(path: Path, *, groups: Sequence[Row], taus: np.ndarray) -> None:
@@ -210,7 +210,7 @@ def profile_figure(path: Path, *, groups: Sequence[Row], taus: np.ndarray) -> No
         axis.grid(alpha=0.3)
     axis.figure.axes[0].set_ylabel("share of seeds above tau")
     axis.legend(loc="lower left")
-    _save(figure, path)
+    save(figure, path)
 
 
 def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str = "chosen") -> None:
@@ -266,6 +266,7 @@ def _draw_panels(axes: Sequence[Axes], panels: Sequence[tuple[Row, str]], walls:
         axes[0].figure.colorbar(share, ax=list(axes), label=label)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure, and the folder it is to be in."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
@@ -22,7 +24,7 @@ from envs.vector import VectorEnv
 from star import episode, evaluation, hierarchy, profiling, provenance, report, sinks
 from star import state as states
 from star.checkpoint import Checkpoints, check_compatible
-from star.config import Config, ConfigError, TeacherConfig
+from star.config import AgentConfig, Config, ConfigError, TeacherConfig
 from star.display import Display, Stopwatch
 from star.episode import Episode
 from star.loading import parse
@@ -40,6 +42,18 @@ AFTERWARDS = 2**32 - 2
 
 
 @dataclass(frozen=True)
+class Functions:
+    """The jitted functions of a `Program`. The agent comes first: another one of the same structure needs no compiling.
+
+    States and keys have a leading axis. The floats of the agent are scalars or have that axis too.
+    """
+
+    init: Callable[[AgentConfig, jax.Array], TrainState]
+    epoch: Callable[[AgentConfig, tuple[Demonstrations, ...], TrainState], tuple[TrainState, dict[str, jax.Array]]]
+    evaluate: Callable[[AgentConfig, TrainState, jax.Array], Episode]
+
+
+@dataclass(frozen=True)
 class Program:
     """The compiled parts of a run. States and keys carry a leading axis of seeds."""
 
@@ -48,11 +62,23 @@ class Program:
     walls: np.ndarray
     goal: np.ndarray
     """A test goal as an abstract point [d]: the one of the task, or one of several."""
-    init: Callable[[jax.Array], TrainState]
+    agent: AgentConfig
+    """What is traced: the floats of `config`, or arrays of them with the leading axis of states and keys."""
     lessons: Callable[[], tuple[Demonstrations, ...]]
     """What the teachers show, read when it is first needed; raises `ConfigError`."""
-    epoch: Callable[[TrainState], tuple[TrainState, dict[str, jax.Array]]]
-    evaluate: Callable[[TrainState, jax.Array], Episode]
+    functions: Functions
+
+    def init(self, keys: jax.Array) -> TrainState:
+        """Fresh runs, one from each key."""
+        return self.functions.init(self.agent, keys)
+
+    def epoch(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        """Train for an epoch; `state` is used up."""
+        return self.functions.epoch(self.agent, self.lessons(), state)
+
+    def evaluate(self, state: TrainState, keys: jax.Array) -> Episode:
+        """Greedy episodes on test goals, `trainer.eval_episodes` of each state."""
+        return self.functions.evaluate(self.agent, state, keys)
 
     @property
     def env_steps_per_epoch(self) -> int:
@@ -67,8 +93,7 @@ class Program:
     @property
     def seeds(self) -> list[int]:
         """The seeds trained side by side."""
-        first = self.config.trainer.seed
-        return list(range(first, first + self.config.trainer.num_seeds))
+        return _seeds_of(self.config)
 
 
 @dataclass(frozen=True)
@@ -91,7 +116,6 @@ def build(config: Config) -> Program:
         states.check(config, spec)
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    agent = config.agent()
     test_env = make_env(config, "test")
     trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
     tested = VectorEnv(test_env, config.trainer.eval_episodes, auto_reset=False)
@@ -100,23 +124,29 @@ def build(config: Config) -> Program:
     def lessons() -> tuple[Demonstrations, ...]:
         return tuple(_demonstrations(config, teacher, env, test_env, spec) for teacher in config.sgim.teachers)
 
-    def epoch(agent: Any, lessons: Any, state: TrainState) -> Any:
-        return jax.vmap(partial(hierarchy.epoch, agent, spec, trained, teachers=lessons))(state)
+    def init(agent: AgentConfig, keys: jax.Array) -> Any:
+        return jax.vmap(lambda one, key: states.init(one, spec, key=key), in_axes=(_axis(agent), 0))(agent, keys)
 
-    def evaluate(agent: Any, state: TrainState, keys: jax.Array) -> Any:
-        return jax.vmap(lambda one, key: episode.evaluate(agent, spec, tested, one, key=key))(state, keys)
+    def epoch(agent: AgentConfig, lessons: Any, state: TrainState) -> Any:
+        def one_epoch(one: AgentConfig, state: TrainState) -> Any:
+            return hierarchy.epoch(one, spec, trained, state, teachers=lessons)
 
-    jitted_epoch, jitted_evaluate = jax.jit(epoch, donate_argnums=2), jax.jit(evaluate)
-    init = jax.jit(lambda agent, keys: jax.vmap(lambda key: states.init(agent, spec, key=key))(keys))
+        return jax.vmap(one_epoch, in_axes=(_axis(agent), 0))(agent, state)
+
+    def evaluate(agent: AgentConfig, state: TrainState, keys: jax.Array) -> Any:
+        def one_evaluation(one: AgentConfig, state: TrainState, key: jax.Array) -> Any:
+            return episode.evaluate(one, spec, tested, state, key=key)
+
+        return jax.vmap(one_evaluation, in_axes=(_axis(agent), 0, 0))(agent, state, keys)
+
     return Program(
         config=config,
         spec=spec,
         walls=np.asarray(env.arena.walls()),
         goal=_a_goal(spec, test_env),
-        init=lambda keys: init(agent, keys),
+        agent=config.agent(),
         lessons=lessons,
-        epoch=lambda state: jitted_epoch(agent, lessons(), state),
-        evaluate=lambda state, keys: jitted_evaluate(agent, state, keys),
+        functions=Functions(jax.jit(init), jax.jit(epoch, donate_argnums=2), jax.jit(evaluate)),
     )
 
 
@@ -215,18 +245,77 @@ def agent_number(program: Program, run_dir: Path, agent: int | None) -> int:
     return program.seeds.index(agent)
 
 
+class SideBySide:
+    """Runs that share their `structure`, trained side by side in one program. Each has a slot, and may come and go.
+
+    What a run does depends on nothing but its own config, so it is what `train` would do.
+    """
+
+    def __init__(self, config: Config, slots: int) -> None:
+        """Compile for `slots` runs like `config`; raises `ConfigError` if it cannot be trained."""
+        program = build(config)
+        program.lessons()
+        self.slots = slots
+        self.epochs = program.epochs
+        self.env_steps_per_epoch = program.env_steps_per_epoch * config.trainer.num_seeds
+        self._program = program
+        self._configs = [program.config] * slots
+        self._state: TrainState | None = None
+
+    def put(self, runs: Mapping[int, Config]) -> None:
+        """Begin new runs in these slots; what was there is gone."""
+        for slot, config in runs.items():
+            self._configs[slot] = resolve(config, self._program.config.env.engine, self._program.spec)
+        each = self._program.config.trainer.num_seeds
+        agent = jax.tree.map(
+            lambda *leaves: np.repeat(np.asarray(leaves, np.float32), each), *[one.agent() for one in self._configs]
+        )
+        self._program = replace(self._program, agent=agent)
+        fresh = self._program.init(_seed_keys(self._seeds()))
+        if self._state is None:
+            self._state = fresh
+        else:
+            new = np.repeat([slot in runs for slot in range(self.slots)], each)
+            self._state = _replace_where(new, fresh, self._state)
+
+    def advance(self) -> list[list[dict[str, Any]]]:
+        """Train all slots for an epoch: the metrics of each seed, for each slot, with `eval/` where it is time."""
+        assert self._state is not None
+        settings, seeds = self._program.config.trainer, self._seeds()
+        self._state, metrics = self._program.epoch(self._state)
+        table = _rows(metrics, seeds)
+        done = np.asarray(self._state.epoch)
+        due = (done % settings.eval_every == 0) | (done == self.epochs)
+        if due.any():
+            episodes = self._program.evaluate(self._state, _evaluation_keys(seeds, done, stream=_DURING_TRAINING))
+            _add_evaluation(table, episodes, where=due)
+        for row, epochs in zip(table, done, strict=True):
+            row["env_steps"] = int(epochs) * self._program.env_steps_per_epoch
+        each = settings.num_seeds
+        return [table[slot * each : (slot + 1) * each] for slot in range(self.slots)]
+
+    def _seeds(self) -> list[int]:
+        return [seed for config in self._configs for seed in _seeds_of(config)]
+
+
+def structure(config: Config) -> str:
+    """What runs must share to be trained `SideBySide`: everything but the agent's floats and the first seed."""
+    values = config.model_dump(mode="json", exclude={"trainer": {"seed"}})
+    same = jax.tree.map(lambda _: 0.0, config.agent())
+    return json.dumps(values | same.model_dump(mode="json"), sort_keys=True)
+
+
 def evaluation_keys(program: Program, number: int, *, stream: int = _DURING_TRAINING) -> jax.Array:
     """Keys of one evaluation, one per seed, apart from all keys of training.
 
     `number` is the epoch in the stream of evaluations during training, or the seed that a user chose afterwards.
     """
-    base = jax.random.fold_in(jax.random.key(stream), number)
-    return jax.vmap(partial(jax.random.fold_in, base))(np.asarray(program.seeds, np.uint32))
+    return _evaluation_keys(program.seeds, [number] * len(program.seeds), stream=stream)
 
 
 def seed_keys(program: Program) -> jax.Array:
     """Keys that the states of all seeds start from."""
-    return jax.vmap(jax.random.key)(np.asarray(program.seeds, np.uint32))
+    return _seed_keys(program.seeds)
 
 
 def select_device(device: str) -> None:
@@ -269,7 +358,7 @@ def _loop(
     )
     trace = Profile(run_dir / "profile", first=profile[0], epochs=profile[1], say=display.say, warn=display.warn)
     with Sinks(run_dir, program.config, rows, warn=display.warn) as others:
-        with display, trace, _interruptible(display.stop) as interrupted:
+        with display, trace, interruptible(display.stop) as interrupted:
             while done < program.epochs and not interrupted():
                 trace.before(done)
                 with stopwatch.measure("epoch"):
@@ -357,11 +446,41 @@ def _rows(metrics: dict[str, jax.Array], seeds: list[int]) -> list[dict[str, Any
     return [{"seed": seed} | {k: v[i].item() for k, v in host.items()} for i, seed in enumerate(seeds)]
 
 
-def _add_evaluation(table: list[dict[str, Any]], episodes: Episode) -> None:
+def _add_evaluation(table: list[dict[str, Any]], episodes: Episode, *, where: np.ndarray | None = None) -> None:
+    """Add the statistics of `episodes` to the rows of `table`, or to those where the mask says so."""
     host = jax.device_get(episodes)
     for i, row in enumerate(table):
+        if where is not None and not where[i]:
+            continue
         summary = evaluation.summarise(jax.tree.map(lambda x, i=i: x[i], host))
         row |= {f"eval/{name}": summary[name] for name in ("success_any", "success_final", "distance", "return")}
+
+
+def _axis(agent: AgentConfig) -> int | None:
+    """The axis of `agent` under a vmap over states: none if its floats are scalars."""
+    return 0 if np.ndim(jax.tree.leaves(agent)[0]) else None
+
+
+@jax.jit
+def _replace_where(mask: jax.Array, new: TrainState, old: TrainState) -> TrainState:
+    """`new` where `mask` [n] is set, else `old`, along the leading axis."""
+    return jax.vmap(lambda pick, a, b: jax.tree.map(partial(jnp.where, pick), a, b))(mask, new, old)
+
+
+def _seeds_of(config: Config) -> list[int]:
+    first = config.trainer.seed
+    return list(range(first, first + config.trainer.num_seeds))
+
+
+def _seed_keys(seeds: Sequence[int]) -> jax.Array:
+    return jax.vmap(jax.random.key)(np.asarray(seeds, np.uint32))
+
+
+def _evaluation_keys(seeds: Sequence[int], numbers: Sequence[int] | np.ndarray, *, stream: int) -> jax.Array:
+    base, fold = jax.random.key(stream), jax.random.fold_in
+    return jax.vmap(lambda number, seed: fold(fold(base, number), seed))(
+        np.asarray(numbers, np.uint32), np.asarray(seeds, np.uint32)
+    )
 
 
 def _latest_success(rows: list[dict[str, Any]]) -> float | None:
@@ -442,7 +561,7 @@ def make_env(config: Config, goals: str, **others: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _interruptible(on_first: Callable[[], None]) -> Iterator[Callable[[], bool]]:
+def interruptible(on_first: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
     """Yields a function that tells whether Ctrl-C was pressed, upon which it calls `on_first`; a second one stops."""
     pressed = False
 

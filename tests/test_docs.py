@@ -12,7 +12,7 @@ import pytest
 import envs
 from envs import opengl
 from envs.tasks import TASKS
-from star import assessment, cli, record, rendering, tables, trainer
+from star import assessment, cli, record, rendering, sweep, tables, trainer
 from star.cli import main
 from star.config import Config
 from star.loading import fields, parse
@@ -75,6 +75,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg
     monkeypatch.setattr(rendering, "render", lambda config, show, **_: "")
     monkeypatch.setattr("star.page.write", lambda runs, out: "")
+    monkeypatch.setattr(sweep, "run", lambda found, out, **_: sweep.Summary([], True, {"trial": 0}))
     monkeypatch.setattr(record, "record", lambda config, run_dir, out, **_: "")
     return tmp_path
 
@@ -131,7 +132,8 @@ def test_the_commands_of_the_tutorial_work_as_they_are_but_smaller(run, tmp_path
 def test_the_pages_show_how_to_train_resume_evaluate_and_look_things_up():
     shown = {tuple(one.values[0][1:3]) for one in STAR}
     assert ("train", "configs/point_maze.yaml") in shown and ("train", "--resume") in shown
-    assert {"train", "evaluate", "render", "record", "report", "settings", "envs"} == {words[0] for words in shown}
+    words = {"train", "sweep", "evaluate", "render", "record", "report", "settings", "envs"}
+    assert words == {words[0] for words in shown}
 
 
 @pytest.mark.parametrize("words", MAKE)

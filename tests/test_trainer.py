@@ -76,14 +76,16 @@ def saved_state(config, run_dir):
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once():
-    """Compiling takes nearly all the time of these tests, and a program has no state: equal configs share one."""
+    """Compiling takes nearly all the time of these tests, and a program has no state: configs of a structure share."""
     build, programs = trainer.build, {}
 
     def shared(config):
-        key = config.to_yaml()
+        key = trainer.structure(config)
         if key not in programs:
             programs[key] = build(config)
-        return programs[key]
+        program = programs[key]
+        resolved = trainer._resolve(config, program.config.env.engine, program.spec)
+        return dataclasses.replace(program, config=resolved, agent=resolved.agent())
 
     trainer.build = shared
     yield
@@ -380,6 +382,33 @@ def test_the_published_setting_trains(tmp_path):
     assert np.isfinite([last["controller/critic_loss"], last["tutor/critic_loss"], last["train/return"]]).all()
 
 
+def test_runs_side_by_side_are_each_what_train_makes_of_them(finished, tmp_path):
+    """They differ in numbers of all levels and in the seed; one is given up half-way for another."""
+    numbers = {
+        "controller__ppo__learning_rate": 2e-3,
+        "tutor__ppo__discount": 0.5,
+        "commander__epsilon_start": 0.1,
+        "forward_model__learning_rate": 1e-2,
+        "trainer__seed": 3,
+    }
+    usual, other = tiny(), tiny(**numbers)
+    assert trainer.structure(usual) == trainer.structure(other) != trainer.structure(tiny(trainer__num_envs=8))
+    bench = trainer.SideBySide(usual, 2)
+    bench.put({0: tiny(commander__discount=0.1), 1: other})
+    rows_of = [[], []]
+    for epoch in range(6):
+        if epoch == 2:
+            bench.put({0: usual})
+        for slot, table in enumerate(bench.advance()):
+            rows_of[slot].extend(table)
+    trainer.train(other, tmp_path / "other", quiet=True)
+    for found, run_dir in ((rows_of[0][4:], finished[0]), (rows_of[1][:8], tmp_path / "other")):
+        for row, expected in zip(found, rows(run_dir), strict=True):
+            assert row.keys() == expected.keys()
+            for key, value in row.items():
+                assert value == pytest.approx(expected[key], rel=2e-3, abs=1e-4), (key, row["env_steps"])
+
+
 def interrupt_after(monkeypatch, *, epochs):
     """Press Ctrl-C during epoch number `epochs`."""
     build = trainer.build
@@ -388,13 +417,13 @@ def interrupt_after(monkeypatch, *, epochs):
         program = build(config)
         calls = []
 
-        def epoch(state):
+        def epoch(*arguments):
             calls.append(None)
             if len(calls) == epochs:
                 signal.raise_signal(signal.SIGINT)
-            return program.epoch(state)
+            return program.functions.epoch(*arguments)
 
-        return dataclasses.replace(program, epoch=epoch)
+        return dataclasses.replace(program, functions=dataclasses.replace(program.functions, epoch=epoch))
 
     monkeypatch.setattr(trainer, "build", pressing)
 

@@ -1,0 +1,376 @@
+"""Sweeps: the file, the trials side by side, and workers that share a study."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import csv
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+import yaml
+
+from star import cli, sweep, trainer
+from star.config import ConfigError
+from star.loading import fields, kind, load, parse
+from star.study import Ledger, reason
+from star.sweep import open_ledger, plan, work
+
+ROOT = Path(__file__).parents[1]
+EPOCH = 4 * 60  # env steps
+
+TINY = {
+    "env": {"name": "point_maze", "engine": "jax", "options": {"episode_length": 60}},
+    "commander": {"period": 20},
+    "tutor": {"unroll": 3, "ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
+    "controller": {"ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
+    "abstraction": {"max_regions": 8, "cuts": [[8.0], [8.0]]},
+    "forward_model": {"hidden": [8], "buffer_size": 64, "batch_size": 8, "updates_per_epoch": 2},
+    "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
+    "trainer": {"num_envs": 4, "total_env_steps": 4 * EPOCH, "eval_every": 2, "eval_episodes": 3},
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A working directory with a config file."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    return tmp_path
+
+
+def written(**fields):
+    """A sweep file, three learning rates as a grid unless said otherwise."""
+    values = {"config": "tiny.yaml", "parameters": {"controller.ppo.learning_rate": [1e-4, 1e-3, 1e-2]}}
+    path = Path("three.yaml")
+    path.write_text(yaml.safe_dump(values | {"sampler": "grid"} | fields))
+    return path
+
+
+@pytest.fixture(autouse=True)
+def closed(monkeypatch):
+    """Databases are let go of at the end of each test."""
+    ledgers = []
+
+    class Closing(Ledger):
+        def __init__(self, *arguments, **settings):
+            super().__init__(*arguments, **settings)
+            ledgers.append(self)
+
+    monkeypatch.setattr(sweep, "Ledger", Closing)
+    yield
+    for ledger in ledgers:
+        ledger.close()
+
+
+class Stub:
+    """Trains nothing: an epoch takes `wait_s`, and a trial is as good as its `controller.ppo.learning_rate` is high."""
+
+    epochs, env_steps_per_epoch = 4, EPOCH
+
+    def __init__(self, config, slots, *, wait_s=0.0):
+        self.slots, self.wait_s = slots, wait_s
+        self.runs, self.done = {}, dict.fromkeys(range(slots), 0)
+
+    def put(self, runs):
+        self.runs |= runs
+        self.done |= dict.fromkeys(runs, 0)
+
+    def advance(self):
+        time.sleep(self.wait_s)
+        return [self.rows(slot) for slot in range(self.slots)]
+
+    def rows(self, slot):
+        self.done[slot] += 1
+        ppo = self.runs[slot].controller.ppo
+        row = {"seed": 0, "env_steps": self.done[slot] * EPOCH, "controller/actor_loss": self.loss(ppo)}
+        if self.done[slot] % 2 == 0:
+            success = min(100 * ppo.learning_rate, 1.0)
+            row |= {"eval/success_any": success, "eval/success_final": success * self.done[slot] / 4}
+        return [row]
+
+    def loss(self, ppo):
+        return float("nan") if ppo.discount == 0 else 0.5
+
+
+def finished(path, make=Stub, *, out="out", **changes):
+    """A sweep in which nothing is trained: its plan and its ledger, at the end."""
+    found = plan(path, **changes)
+    Path(out).mkdir(exist_ok=True)
+    ledger = open_ledger(found, f"sqlite:///{out}/sweep.db")
+    assert work(found, ledger, make=make)
+    return found, ledger
+
+
+def test_every_float_of_the_agent_may_differ_side_by_side_and_nothing_else():
+    """What `structure` takes for equal is one jitted function; whatever else changes is another."""
+    base = parse(TINY)
+    for key, _, _ in fields():
+        if kind(key) is float:
+            other = parse(TINY, {key: 0.5 if key != "commander.goal_margin" else 2.0})
+            assert trainer.structure(other) == trainer.structure(base), key
+        elif kind(key) is bool:
+            values = base.model_dump(mode="json")
+            for part in key.split(".")[:-1]:
+                values = values[part]
+            with contextlib.suppress(ConfigError):  # some need others
+                flipped = parse(TINY, {key: not values[key.split(".")[-1]]})
+                assert trainer.structure(flipped) != trainer.structure(base), key
+    assert trainer.structure(parse(TINY, {"trainer.seed": 7})) == trainer.structure(base)
+    assert trainer.structure(parse(TINY, {"trainer.num_seeds": 7})) != trainer.structure(base)
+
+
+def test_a_grid_tries_every_point_once_and_writes_down_which_is_best(folder, capsys, monkeypatch):
+    monkeypatch.setattr(sweep.work, "__kwdefaults__", sweep.work.__kwdefaults__ | {"make": Stub})
+    parameters = {"controller.ppo.learning_rate": ["1e-4", 1e-3], "tutor.ppo.hidden": [[8], [4, 4]]}
+    path = written(parameters=parameters)
+    assert cli.main(["sweep", str(path), "--out", "out"]) == 0
+    with open("out/trials.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 4 and [float(row["value"]) for row in rows] == [0.1, 0.1, 0.01, 0.01]
+    assert {(row["controller.ppo.learning_rate"], row["tutor.ppo.hidden"]) for row in rows} == {
+        (rate, hidden) for rate in ("0.0001", "0.001") for hidden in ("[8]", "[4, 4]")
+    }
+    best = load("out/best.yaml")
+    assert best.controller.ppo.learning_rate == 1e-3 and best.trainer.num_envs == 4
+    for name in ("values", "parallel", "importance"):
+        assert Path(f"out/figures/{name}.png").read_bytes().startswith(b"\x89PNG")
+    out = capsys.readouterr().out
+    assert "4 trials by success_final" in out and "next:    star train out/best.yaml" in out
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "cmaes"])
+def test_samplers_stay_in_the_range_and_draw_no_trial_twice(folder, sampler):
+    parameters = {
+        "controller.ppo.learning_rate": {"low": 1e-4, "high": 1e-2, "log": True},
+        "tutor.ppo.passes": {"low": 1, "high": 3},
+    }
+    _, ledger = finished(written(parameters=parameters, sampler=sampler, trials=7, batch=3))
+    drawn = [trial.params for trial in ledger.trials()]
+    rates = [one["controller.ppo.learning_rate"] for one in drawn]
+    assert len(set(rates)) == 7 and all(1e-4 <= rate <= 1e-2 for rate in rates)
+    assert all(one["tutor.ppo.passes"] in (1, 2, 3) for one in drawn)
+
+
+@pytest.mark.parametrize(("summary", "value"), [("end", 1.0), ("mean", 0.75)])
+def test_the_value_is_that_at_the_end_or_the_mean_of_all_evaluations(folder, summary, value):
+    _, ledger = finished(written(summary=summary))
+    assert max(trial.value for trial in ledger.trials()) == value
+
+
+@pytest.mark.parametrize("pruner", ["asha", "hyperband", "median"])
+def test_pruners_stop_what_is_worse_and_the_best_goes_on(folder, pruner):
+    rates = [10 ** (-4 + index * 5 % 12 / 6) for index in range(12)]
+    parameters = {"controller.ppo.learning_rate": rates}
+    _, ledger = finished(written(parameters=parameters, pruner=pruner, batch=6))
+    states = collections.Counter(trial.state.name for trial in ledger.trials())
+    assert states["PRUNED"] > 0 and states["PRUNED"] + states["COMPLETE"] == 12
+    assert ledger.study.best_params["controller.ppo.learning_rate"] == max(rates)
+
+
+def test_a_broken_trial_is_recorded_with_its_reason_and_the_rest_goes_on(folder):
+    """One has a loss that is no number, one a rollout that cannot be divided; one is too large for the device."""
+
+    def make(config, slots):
+        if config.tutor.ppo.hidden == (999,):
+            raise RuntimeError("RESOURCE_EXHAUSTED: out of memory")
+        return Stub(config, slots)
+
+    parameters = {
+        "controller.ppo.discount": [0.0, 0.9],
+        "controller.ppo.minibatches": [1, 7],
+        "tutor.ppo.hidden": [[8], [999]],
+    }
+    _, ledger = finished(written(parameters=parameters), make)
+    reasons = sorted(reason(trial) for trial in ledger.trials())
+    assert reasons[0] == "" and reasons[1] == "RuntimeError: RESOURCE_EXHAUSTED: out of memory"
+    assert sum("controller/actor_loss is not finite at 240 env steps" in one for one in reasons) == 1
+    assert sum("controller.ppo.minibatches: 7 does not divide" in one for one in reasons) == 4
+
+
+def test_an_interrupted_sweep_gives_its_trials_back_and_goes_on_where_it_was(folder, monkeypatch):
+    class Pressing(Stub):
+        def advance(self):
+            signal.raise_signal(signal.SIGINT)
+            return super().advance()
+
+    found = plan(written())
+    ledger = open_ledger(found, "sqlite:///sweep.db")
+    assert not work(found, ledger, make=Pressing)
+    assert [trial.state.name for trial in ledger.trials()] == ["WAITING"] * 3
+    assert work(found, ledger, make=Stub)
+    assert len({trial.params["controller.ppo.learning_rate"] for trial in ledger.trials()}) == 3
+    assert all(trial.state.name == "COMPLETE" for trial in ledger.trials())
+
+
+def test_more_trials_can_be_asked_for_later(folder):
+    path = written(sampler="random", parameters={"controller.ppo.learning_rate": {"low": 1e-4, "high": 1e-2}})
+    assert len(finished(path, trials=3)[1].trials()) == 3
+    assert len(finished(path, trials=5)[1].trials()) == 5
+    assert len(finished(path, trials=4)[1].trials()) == 5
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.glob("configs/sweeps/*.yaml")), ids=lambda path: path.stem)
+def test_every_shipped_sweep_is_valid_and_trains_side_by_side(path):
+    found = plan(path)
+    ends = [{key: one.ends[end] for key, one in found.file.parameters.items()} for end in (0, -1)]
+    assert len({trainer.structure(found.config(values)) for values in ends}) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"parameters": {"controller.ppo.lerning_rate": [1, 2]}}, "did you mean controller.ppo.learning_rate?"),
+        ({"parameters": {"controller.ppo.learning_rate": []}}, "has no values to choose from"),
+        ({"parameters": {}}, "parameters"),
+        (
+            {"parameters": {"commander.discount": {"low": 0.5, "high": 1.5}}, "sampler": "tpe"},
+            "commander.discount: 1.5",
+        ),
+        ({"parameters": {"commander.discount": {"low": 0.9, "high": 0.5}}, "sampler": "tpe"}, "low 0.9 is above high"),
+        ({"parameters": {"commander.discount": {"low": 0.5, "high": 0.9}}}, "sampler grid needs choices"),
+        ({"parameters": {"commander.discount": {"low": 0.5}}}, "both low and high"),
+        ({"parameters": {"tutor.enabled": {"low": 0, "high": 1}}, "sampler": "tpe"}, "tutor.enabled"),
+        ({"parameters": {"env.options.mapp": ["a"]}}, "mapp"),
+        ({"sampler": "cmaes"}, "cmaes needs two or more"),
+        ({"sampler": "best"}, "sampler: 'best' is not allowed"),
+        ({"sampla": "grid"}, "sampla: unknown key (did you mean sampler?)"),
+        ({"config": "no.yaml"}, "no.yaml: no such file"),
+        ({"settings": {"tutor.perod": 5}}, "did you mean tutor.period?"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_one_line_and_nothing_is_written(folder, capsys, change, said):
+    path = written(**change)
+    before = sorted(folder.iterdir())
+    assert cli.main(["sweep", str(path)]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and said in err and err.count("\n") == 1
+    assert sorted(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("--storage postgresql://nobody@localhost:1/none", "the database cannot be used"),
+        ("--storage mysql://a/b", "is not sqlite:///FILE or postgresql://"),
+        ("--storage nonsense", "is not an address"),
+        ("--out full", "full: is not empty and holds no sweep.db"),
+        ("--trials 0", "--trials"),
+    ],
+)
+def test_a_place_that_cannot_be_used_is_one_line_and_nothing_is_written(folder, capsys, arguments, said):
+    (folder / "full").mkdir()
+    (folder / "full" / "thesis.txt").write_text("ten years of work")
+    path = written()
+    before = sorted(folder.rglob("*"))
+    if "postgresql" in arguments:
+        pytest.importorskip("psycopg")
+    assert cli.main(["sweep", str(path), *arguments.split()]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and said in err and err.count("\n") == 1
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_the_study_of_another_sweep_is_refused(folder):
+    finished(written())
+    other = plan(written(), settings={"tutor.reward_scale": 0.7})
+    with pytest.raises(ConfigError, match=r"study three: is of another sweep, with settings.tutor.reward_scale 0.3"):
+        open_ledger(other, "sqlite:///out/sweep.db")
+
+
+WORKERS = """
+import os, sys
+sys.path.insert(0, {tests!r})
+from pathlib import Path
+from star.sweep import open_ledger, plan, work
+from test_sweep import Stub
+
+def worker():
+    found = plan(Path("three.yaml"))
+    ledger = open_ledger(found, sys.argv[1], beat_s=1, grace_s=3)
+    return 0 if work(found, ledger, make=lambda config, slots: Stub(config, slots, wait_s=0.3)) else 1
+
+pids = []
+for _ in range(int(sys.argv[2])):  # forked, because importing JAX is what takes long
+    pid = os.fork()
+    if not pid:
+        os._exit(worker())
+    pids.append(pid)
+print(*pids, flush=True)
+print(*[os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in pids], flush=True)
+"""
+
+
+def shared(url, *, workers):
+    """Let workers share 16 trials and kill one in the middle of its own: the ledger, and what that one held."""
+    parameters = {"controller.ppo.learning_rate": {"low": 1e-4, "high": 1e-2}}
+    path = written(sampler="random", parameters=parameters, trials=16, batch=2)
+    ledger = open_ledger(plan(path), url)
+    where = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-c", WORKERS.format(tests=str(ROOT / "tests")), url, str(workers)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | where) as process:
+        pids = [int(pid) for pid in process.stdout.readline().split()]
+        held = []
+        while not held:
+            running = [trial for trial in ledger.trials() if trial.state.name == "RUNNING"]
+            held = [trial.number for trial in running if trial.user_attrs.get("worker", "").endswith(f":{pids[0]}")]
+        os.kill(pids[0], signal.SIGKILL)
+        codes = [int(code) for code in process.communicate(timeout=120)[0].split()]
+    assert codes == [-signal.SIGKILL] + [0] * (workers - 1)
+    return ledger, held
+
+
+def check_shared(ledger, held):
+    trials = ledger.trials()
+    assert [trial.state.name for trial in trials] == ["COMPLETE"] * 16
+    assert len({trial.params["controller.ppo.learning_rate"] for trial in trials}) == 16
+    everything = {trial.number: trial for trial in ledger.study.get_trials(deepcopy=False)}
+    given_back = [number for number in held if everything[number].state.name == "FAIL"]
+    assert given_back and len(everything) == 16 + len(given_back)
+
+
+def test_two_workers_on_one_sqlite_file_end_all_trials_though_one_is_killed(folder):
+    check_shared(*shared(f"sqlite:///{folder}/sweep.db", workers=2))
+
+
+def test_four_workers_on_postgresql_end_all_trials_though_one_is_killed(folder, postgresql):
+    ledger, held = shared(postgresql, workers=4)
+    check_shared(ledger, held)
+    assert len({trial.user_attrs["worker"] for trial in ledger.trials()}) >= 3
+
+
+@pytest.fixture
+def postgresql(tmp_path_factory):
+    """The address of an empty database; the server runs as another user if the tests run as root."""
+    pytest.importorskip("psycopg", reason="psycopg is not installed")
+    folders = [str(path) for path in Path("/usr/lib/postgresql").glob("*/bin")]
+    path = os.pathsep.join([*folders, os.environ.get("PATH", "")])
+    initdb, pg_ctl = shutil.which("initdb", path=path), shutil.which("pg_ctl", path=path)
+    if initdb is None or pg_ctl is None:
+        pytest.skip("PostgreSQL is not installed")
+    where = Path(tempfile.mkdtemp(prefix="pg", dir="/tmp"))  # the path of a socket must be short
+    user = {}
+    if os.geteuid() == 0:
+        account = pwd.getpwnam("nobody")
+        os.chown(where, account.pw_uid, account.pw_gid)
+        user = {"user": account.pw_uid, "group": account.pw_gid, "extra_groups": []}
+
+    def run(*command):
+        subprocess.run(command, check=True, capture_output=True, cwd=where, timeout=60, **user)
+
+    options = f"-c listen_addresses='' -k {where} -c fsync=off"
+    try:
+        run(initdb, "-D", where / "data", "-U", "star", "-A", "trust", "--no-sync")
+        run(pg_ctl, "-D", where / "data", "-l", where / "log", "-o", options, "-w", "start")
+        yield f"postgresql://star@/postgres?host={where}"
+        run(pg_ctl, "-D", where / "data", "-m", "immediate", "stop")
+    finally:
+        shutil.rmtree(where, ignore_errors=True)
