@@ -5,7 +5,7 @@
              decomposition   first to what is mastered best in another region, then to the goal
     teacher  outcome         the goal is the demonstrated outcome nearest to it (emulation)
              action          so it is, and the Controller imitates the demonstrated actions (mimicry)
-             decomposition   along the demonstrated route, waypoint by waypoint
+             decomposition   along the demonstrated route, region by region and waypoint by waypoint
 
 The competence of an episode is c = 1 - min(1, d_T / d_0), d the distance to the ball of success around the goal.
 
