@@ -1,9 +1,13 @@
 """What all tests share: JAX on the CPU, compiled quickly, and a tiny hierarchy, recorded step by step."""
 
 import os
+from pathlib import Path
 
 os.environ["JAX_PLATFORMS"] = "cpu"
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # compilation is most of what tests cost
+# Compilation is most of what tests cost: it is done in haste, and kept for other processes and the next time.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 from dataclasses import replace  # noqa: E402
 from types import SimpleNamespace  # noqa: E402

@@ -107,9 +107,10 @@ def test_the_commands_of_the_tutorial_work_as_they_are_but_smaller(run, tmp_path
 
     def shared(config):
         """What trains, goes on and is evaluated is the same program: it is compiled once."""
-        program = build(config)
-        same = program.config.model_copy(update={"trainer": program.config.trainer.model_copy(update=ENDLESS)})
-        return dataclasses.replace(programs.setdefault(same.to_yaml(), program), config=program.config)
+        endless = config.model_copy(update={"trainer": config.trainer.model_copy(update=ENDLESS)})
+        program = programs.setdefault(trainer.structure(endless), build(config))
+        resolved = trainer.resolve(config, program.config.env.engine, program.spec)
+        return dataclasses.replace(program, config=resolved, agent=resolved.agent())
 
     monkeypatch.setattr(trainer, "build", shared)
     try:

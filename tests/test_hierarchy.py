@@ -130,7 +130,7 @@ def test_the_tutors_chain_is_cut_where_the_target_or_the_episode_ends(recording)
 
 
 class Epoch:
-    """The jitted epoch for one configuration and for two at once, with the number of times each was traced."""
+    """The jitted epoch of a configuration, with the number of times it was traced."""
 
     def __init__(self, env, values, spec=None):
         self.spec = spec or Spec.of(env.env)
@@ -142,7 +142,6 @@ class Epoch:
             return hierarchy.epoch(agent, self.spec, env, state)
 
         self.one = jax.jit(once)
-        self.many = jax.jit(jax.vmap(lambda agent, state: hierarchy.epoch(agent, self.spec, env, state)))
         self.init = jax.jit(lambda key: star.state.init(self.config.agent(), self.spec, key=key))
 
 
@@ -217,21 +216,6 @@ def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neithe
     assert epoch.traces == 1
 
 
-def test_seeds_and_hyperparameters_train_side_by_side_as_they_would_alone(epoch, tiny):
-    agents = [
-        epoch.config.agent(),
-        loading.parse(tiny, {"controller.reward_scale": 3.0, "commander.epsilon_start": 0.0}).agent(),
-    ]
-    states = [epoch.init(jax.random.key(seed)) for seed in (0, 1)]
-    together = epoch.many(stack(*agents), stack(*states))
-    alone = [epoch.one(agent, state) for agent, state in zip(agents, states, strict=True)]
-    for i in range(2):
-        assert_close(jax.tree.map(lambda x, i=i: x[i], together), alone[i])
-    # The same seed under the other hyperparameters, to see that they matter.
-    swapped = epoch.one(agents[1], states[0])
-    assert float(swapped[1]["controller/reward"]) != float(alone[0][1]["controller/reward"])
-
-
 def test_a_split_reaches_every_table_indexed_by_regions(epoch):
     state = epoch.init(jax.random.key(0))
     capacity = state.abstraction.capacity
@@ -281,30 +265,11 @@ def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tin
     assert section in str(caught.value) and "batch_size" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_the_published_learners_run_a_whole_epoch_with_a_heading_too(breaking_env, turning, tiny):
-    """Without one they do in `test_trainer.py`."""
-    td3 = {"hidden": [8], "batch_size": 8, "buffer_size": 64, "min_transitions": 8, "updates_per_rollout": 2}
-    values = {
-        **tiny,
-        "commander": {"period": K, "learner": "q", "practice": 0, "reward": "max", "successors": "known"},
-        "tutor": {"period": L, "unroll": 2, "learner": "td3", "off_policy_correction": True, "td3": td3},
-        "controller": {"learner": "td3", "td3": td3},
-    }
-    published = Epoch(breaking_env, values, turning)
-    start = published.init(jax.random.key(0))
-    end, metrics = published.one(published.config.agent(), start)
-    assert int(end.tutor.updates) == 10 and int(end.controller.updates) == 20
-    assert (np.asarray(end.commander.q) != 0).any()
-    for name, value in metrics.items():
-        assert np.isfinite(value), name
-    for leaf in jax.tree.leaves((end.tutor.params, end.controller.params, end.commander)):
-        assert np.isfinite(leaf).all()
-
-
+ADJACENCY = {"enabled": True, "hidden": [8], "batch_size": 8, "updates_per_epoch": 2}
 LEVELS = {
     "gara": {"tutor.enabled": False},
     "flat": {"commander.enabled": False, "commander.period": 30, "tutor.enabled": False},
-    "hrac": {"commander.enabled": False, "tutor.adjacency.enabled": True, "tutor.adjacency.hidden": [8]},
+    "hrac": {"commander.enabled": False, "tutor.adjacency": ADJACENCY},
 }
 
 

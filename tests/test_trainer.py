@@ -316,7 +316,8 @@ def test_a_numeric_hyperparameter_and_the_sinks_may_change_on_resume(finished, t
 
 
 def test_ctrl_c_writes_a_checkpoint_and_says_how_to_resume(tmp_path):
-    values = TINY | {"sgim": {}, "trainer": TINY["trainer"] | {"total_env_steps": 10**9, "eval_every": 10**6}}
+    alone = {"sgim": {}, "commander": {"enabled": False, "period": 20}, "tutor": {"enabled": False, "unroll": 3}}
+    values = TINY | alone | {"trainer": TINY["trainer"] | {"total_env_steps": 10**9, "eval_every": 10**6}}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
     command = [sys.executable, "-m", "star.cli", "train", "config.yaml", "--run-dir", "run"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
@@ -347,11 +348,12 @@ def test_only_the_latest_checkpoints_and_the_best_are_kept(tmp_path):
     checkpoints.close()
 
 
-def test_the_published_setting_trains(tmp_path):
+def test_the_published_setting_trains_with_subgoals_that_set_a_heading_too(tmp_path):
     small = {
         "env.options": {"preset": "published", "episode_length": 20, "frames": 1},
         "env.engine": "native",
         "commander.period": 10,
+        "tutor.heading": 2.0,
         "trainer.total_env_steps": 40,
         "trainer.eval_every": 1,
         "trainer.eval_episodes": 1,
