@@ -6,7 +6,6 @@ import collections
 import contextlib
 import csv
 import os
-import platform
 import pwd
 import shutil
 import signal
@@ -319,14 +318,15 @@ def shared(url, *, workers):
     command = [sys.executable, "-c", WORKERS.format(tests=str(ROOT / "tests")), url, str(workers)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | where) as process:
         pids = [int(pid) for pid in process.stdout.readline().split()]
-        held = []
-        while not held:
+        busy = []
+        while not busy:
             running = [trial for trial in ledger.trials() if trial.state.name == "RUNNING"]
-            held = [trial.number for trial in running if trial.user_attrs.get("worker", "").endswith(f":{pids[0]}")]
-        os.kill(pids[0], signal.SIGKILL)
+            busy = [trial.user_attrs["worker"] for trial in running if "worker" in trial.user_attrs]
+        killed = int(busy[0].rpartition(":")[2])
+        os.kill(killed, signal.SIGKILL)
         codes = [int(code) for code in process.communicate(timeout=120)[0].split()]
-    assert codes == [-signal.SIGKILL] + [0] * (workers - 1)
-    return ledger, f"{platform.node()}:{pids[0]}"
+    assert codes == [-signal.SIGKILL if pid == killed else 0 for pid in pids]
+    return ledger, busy[0]
 
 
 def check_shared(ledger, killed):
