@@ -168,11 +168,7 @@ def draw_goals(axis: Axes, goals: Sequence[Row], walls: np.ndarray) -> None:
             Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, facecolor=colour.to_rgba(goal["success_any"]))
         )
     _draw_walls(axis, walls)
-    axis.set_xlim(walls[:, 0].min(), walls[:, 2].max())
-    axis.set_ylim(walls[:, 1].min(), walls[:, 3].max())
-    axis.set_aspect("equal")
-    axis.set_xlabel("x")
-    axis.set_ylabel("y")
+    _frame(axis, walls[:, :2], walls[:, 2:])
 
 
 def checkpoints_figure(path: Path, *, runs: Mapping[str, Sequence[Row]]) -> None:
@@ -221,11 +217,13 @@ def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str = "chosen")
         width, height = (high - low)[:2]
         axis.add_patch(Rectangle(low[:2], width, height, facecolor=colour, edgecolor="white", linewidth=1.0))
     _draw_walls(axis, walls)
-    axis.set_xlim(lower[:, 0].min(), upper[:, 0].max())
-    axis.set_ylim(lower[:, 1].min(), upper[:, 1].max())
-    axis.set_aspect("equal")
-    axis.set_xlabel("x")
-    axis.set_ylabel("y")
+    _frame(axis, lower, upper)
+
+
+def _frame(axis: Axes, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Show x and y of all boxes [N, d], to scale."""
+    axis.set(xlim=(lower[:, 0].min(), upper[:, 0].max()), ylim=(lower[:, 1].min(), upper[:, 1].max()))
+    axis.set(xlabel="x", ylabel="y", aspect="equal")
 
 
 def draw_success(axis: Axes, rows: Sequence[Row]) -> None:

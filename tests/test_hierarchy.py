@@ -268,21 +268,20 @@ def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tin
 ADJACENCY = {"enabled": True, "hidden": [8], "batch_size": 8, "updates_per_epoch": 2}
 LEVELS = {
     "gara": {"tutor.enabled": False},
-    "flat": {"commander.enabled": False, "commander.period": 30, "tutor.enabled": False},
     "hrac": {"commander.enabled": False, "tutor.adjacency": ADJACENCY},
 }
 
 
 @pytest.mark.parametrize("name", LEVELS)
 def test_levels_can_be_left_out(breaking_env, turning, tiny, name):
-    """HRAC is HIRO with a loss more, here with subgoals that set a heading, of which adjacency knows nothing."""
+    """Both are left out in `test_trainer.py`. HRAC is HIRO with a loss more, here with subgoals that set a heading, of which adjacency knows nothing."""
     values = loading.parse(tiny, LEVELS[name]).model_dump(mode="json")
     agent = Epoch(breaking_env, values, turning if name == "hrac" else None)
     start = agent.init(jax.random.key(0))
     end, metrics = agent.one(agent.config.agent(), start)
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), start.controller.params, end.controller.params)
     assert any(jax.tree.leaves(moved))
-    assert (end.tutor is None) == ("tutor/kl" not in metrics) == (name in ("gara", "flat"))
+    assert (end.tutor is None) == ("tutor/kl" not in metrics) == (name == "gara")
     assert ("abstraction/regions" in metrics) == (name == "gara")
     assert bool(end.commander.chosen.any()) == (name == "gara")
     assert (end.adjacency is not None and bool(end.adjacency.adjacent.any())) == (name == "hrac")
