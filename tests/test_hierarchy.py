@@ -274,7 +274,10 @@ LEVELS = {
 
 @pytest.mark.parametrize("name", LEVELS)
 def test_levels_can_be_left_out(breaking_env, turning, tiny, name):
-    """Both are left out in `test_trainer.py`. HRAC is HIRO with a loss more, here with subgoals that set a heading, of which adjacency knows nothing."""
+    """HRAC is HIRO with a loss more, here with subgoals that set a heading, of which adjacency knows nothing.
+
+    Both levels are left out in `test_trainer.py`.
+    """
     values = loading.parse(tiny, LEVELS[name]).model_dump(mode="json")
     agent = Epoch(breaking_env, values, turning if name == "hrac" else None)
     start = agent.init(jax.random.key(0))
