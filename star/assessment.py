@@ -387,7 +387,7 @@ def _figures(out: Path, rows: Sequence[Mapping[str, Any]], comparison: Mapping[s
     runs: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
         runs.setdefault(row["run"], []).append(row)
-    names = dict(zip(runs, labels([Path(run) for run in runs]), strict=True))
+    names = dict(zip(runs, report.labels([Path(run) for run in runs]), strict=True))
     for run, own in runs.items():
         if "per_goal" in own[0]:
             path = out / f"goals-{names[run].replace('/', '-')}.png"
@@ -399,9 +399,3 @@ def _figures(out: Path, rows: Sequence[Mapping[str, Any]], comparison: Mapping[s
     if comparison:
         report.profile_figure(out / "profile.png", groups=comparison["groups"], taus=evaluation.TAUS)
         yield out / "profile.png"
-
-
-def labels(runs: Sequence[Path]) -> list[str]:
-    """Short names of runs: their folders', or their whole paths where two folders are called the same."""
-    names = [run.resolve().name for run in runs]
-    return [name if names.count(name) == 1 else str(run) for name, run in zip(names, runs, strict=True)]

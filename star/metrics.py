@@ -72,6 +72,14 @@ class Journal:
         return cls(*(JsonLines(run_dir / f"{name}.jsonl") for name in ("metrics", "regions", "provenance")))
 
 
+def by_step(rows: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:
+    """The rows of each moment, by their env steps, in the order of time."""
+    found: dict[int, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        found.setdefault(row["env_steps"], []).append(row)
+    return [found[step] for step in sorted(found)]
+
+
 def mean(rows: Sequence[Mapping[str, Any]], key: str) -> float | None:
     """Mean of `key` over the rows that have it."""
     values = [float(row[key]) for row in rows if row.get(key) is not None]

@@ -14,7 +14,7 @@ import json
 import math
 import re
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata, resources
@@ -26,9 +26,9 @@ import numpy as np
 from envs import files, video
 from envs.arena import ROBOT
 from envs.options import EnvError
-from star import evaluation, trainer
+from star import evaluation, report, trainer
 from star.config import Config, ConfigError
-from star.metrics import Journal, JsonLines
+from star.metrics import Journal, JsonLines, by_step
 
 MAX_POINTS = 300  # of a curve
 MAX_BOXES = 24_000  # regions of all runs in all frames together
@@ -77,20 +77,16 @@ def write(runs: Mapping[Path, Config], out: Path) -> str:
     """
     trainer.select_device("cpu")  # a GPU may be busy with one of the runs
     try:
-        found = [read(path, config, name=name) for (path, config), name in zip(runs.items(), names(runs), strict=True)]
+        found = [
+            read(path, config, name=name)
+            for (path, config), name in zip(runs.items(), report.labels(list(runs)), strict=True)
+        ]
         page = html(content(found))
         with files.whole(out) as partial:
             partial.write_text(page, encoding="utf-8")
     except EnvError as error:
         raise ConfigError(str(error)) from None
     return f"{out}: {len(found)} run{'s' * (len(found) > 1)}, {out.stat().st_size / 1e6:.1f} MB; open it in a browser"
-
-
-def names(paths: Iterable[Path]) -> list[str]:
-    """What to call runs: the name of the directory, or the whole path where several directories have the same name."""
-    short = {path: path.resolve().name for path in paths}
-    taken = list(short.values())
-    return [name if taken.count(name) == 1 else str(path) for path, name in short.items()]
 
 
 def read(run_dir: Path, config: Config, *, name: str) -> Run:
@@ -101,7 +97,7 @@ def read(run_dir: Path, config: Config, *, name: str) -> Run:
     """
     journal = Journal.of(run_dir)
     seeds = config.trainer.num_seeds
-    epochs = _by_step(_checked(journal.metrics, _METRICS), seeds)
+    epochs = _complete(_checked(journal.metrics, _METRICS), seeds)
     if not epochs:
         raise ConfigError(f"{run_dir}: its metrics.jsonl holds no complete epoch, so there is nothing to show yet")
     return Run(
@@ -109,7 +105,7 @@ def read(run_dir: Path, config: Config, *, name: str) -> Run:
         name=name,
         config=config,
         epochs=epochs,
-        regions=[row for rows in _by_step(_checked(journal.regions, _REGIONS), seeds) for row in rows],
+        regions=[row for rows in _complete(_checked(journal.regions, _REGIONS), seeds) for row in rows],
         starts=_checked(journal.provenance, _PROVENANCE),
     )
 
@@ -128,12 +124,9 @@ def _checked(lines: JsonLines, kinds: Kinds) -> list[Row]:
     return list(rows)
 
 
-def _by_step(rows: Sequence[Row], seeds: int) -> list[list[Row]]:
+def _complete(rows: Sequence[Row], seeds: int) -> list[list[Row]]:
     """The rows of each moment that all `seeds` have written; of the last one some may be missing."""
-    found: dict[int, list[Row]] = {}
-    for row in rows:
-        found.setdefault(row["env_steps"], []).append(row)
-    return [sorted(found[step], key=lambda row: row["seed"]) for step in sorted(found) if len(found[step]) == seeds]
+    return [sorted(of_all, key=lambda row: row["seed"]) for of_all in by_step(rows) if len(of_all) == seeds]
 
 
 def content(runs: Sequence[Run]) -> dict[str, Any]:

@@ -268,3 +268,9 @@ def save(figure: Figure, path: Path) -> None:
     """Write a figure, and the folder it is to be in."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
+
+
+def labels(runs: Sequence[Path]) -> list[str]:
+    """Short names of runs: their folders', or their whole paths where two folders are called the same."""
+    names = [run.resolve().name for run in runs]
+    return [name if names.count(name) == 1 else str(run) for name, run in zip(names, runs, strict=True)]

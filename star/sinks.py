@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 from star.config import Config, ConfigError
-from star.metrics import mean
+from star.metrics import by_step, mean
 
 Row = Mapping[str, Any]
 Warn = Callable[[str], None]
@@ -67,7 +67,7 @@ class TensorBoard:
         self._env_steps = 0
         # Time goes on where an interrupted run stopped, as `wall_s` does.
         self._began = time.time() - (history[-1]["wall_s"] if history else 0.0)
-        for rows in _epochs(history):
+        for rows in by_step(history):
             self._add(rows)
         self._flush()
 
@@ -268,11 +268,3 @@ def numbers(rows: Sequence[Row]) -> dict[str, float]:
         if value is not None and math.isfinite(value):
             found[key] = value
     return found
-
-
-def _epochs(history: Sequence[Row]) -> list[list[Row]]:
-    """The rows of each epoch, in the order of time."""
-    epochs: dict[int, list[Row]] = {}
-    for row in history:
-        epochs.setdefault(row["env_steps"], []).append(row)
-    return list(epochs.values())

@@ -30,6 +30,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from envs import EnvError, files
 from star import sweep_report, trainer
 from star.config import Config, ConfigError, Positive
 from star.loading import check_setting, explain, kind, load, parse, read_file
@@ -249,11 +250,14 @@ def run(
             finished = work(found, ledger, quiet=quiet, console=console)
             trials, shares = ledger.trials(), sweep_report.importance(ledger.study)
     rows = [_row(found, trial) for trial in trials]
-    sweep_report.write(out, rows, parameters=list(found.distributions), objective=found.objective, shares=shares)
     best = _best(rows)
-    if best is not None:
-        text = found.config(trials[rows.index(best)].params).to_yaml()
-        sweep_report.replace(out / "best.yaml", lambda path: path.write_text(text, encoding="utf-8"))
+    try:
+        sweep_report.write(out, rows, parameters=list(found.distributions), objective=found.objective, shares=shares)
+        if best is not None:
+            with files.whole(out / "best.yaml") as path:
+                path.write_text(found.config(trials[rows.index(best)].params).to_yaml(), encoding="utf-8")
+    except EnvError as error:
+        raise ConfigError(str(error)) from None
     return Summary(rows, finished, best)
 
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from rich.table import Table
 
+from envs import files
 from star.report import save
 
 Row = Mapping[str, Any]
@@ -29,15 +28,18 @@ def write(
     out: Path, rows: Sequence[Row], *, parameters: Sequence[str], objective: str, shares: Mapping[str, float]
 ) -> None:
     """Write `trials.csv`, best first, and the figures that the complete and pruned trials in `rows` allow."""
-    replace(out / "trials.csv", lambda path: _write_csv(path, sorted(rows, key=_rank)))
+    with files.whole(out / "trials.csv") as path:  # other workers may be at it too
+        _write_csv(path, sorted(rows, key=_rank))
     valued = [row for row in rows if row["value"] is not None]
     if not valued:
         return
     figures = {"values": values_figure(valued, objective), "parallel": parallel_figure(valued, parameters, objective)}
     if shares:
         figures["importance"] = importance_figure(shares, objective)
+    (out / "figures").mkdir(exist_ok=True)
     for name, figure in figures.items():
-        replace(out / "figures" / f"{name}.png", partial(save, figure))
+        with files.whole(out / "figures" / f"{name}.png") as path:
+            save(figure, path)
 
 
 def table(rows: Sequence[Row], *, parameters: Sequence[str], objective: str) -> Table:
@@ -117,14 +119,6 @@ def importance_figure(shares: Mapping[str, float], objective: str) -> Figure:
     axis.bar_label(bars, fmt="%.2f", padding=3)
     axis.set(xlabel=f"importance for {objective}", xlim=(0, 1.1))
     return figure
-
-
-def replace(path: Path, fill: Callable[[Path], object]) -> None:
-    """Write a file beside `path` with `fill`, then put it in its place: other workers may be at it too."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{os.getpid()}-{path.name}")
-    fill(partial)
-    partial.replace(path)
 
 
 def _write_csv(path: Path, rows: Sequence[Row]) -> None:

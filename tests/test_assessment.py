@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import assessment, cli, episode, loading, rendering, trainer
+from star import assessment, cli, episode, loading, rendering, report, trainer
 from star.assessment import Exam, Target
 from star.checkpoint import Checkpoints
 from star.episode import Episode
@@ -195,4 +195,4 @@ def test_the_folder_of_an_evaluation_holds_its_rows_and_a_figure_for_everything_
 
 def test_runs_are_called_by_their_folders_unless_two_are_called_the_same():
     runs = [Path("a/x"), Path("b/x"), Path("c/y")]
-    assert assessment.labels(runs) == ["a/x", "b/x", "y"]
+    assert report.labels(runs) == ["a/x", "b/x", "y"]

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from star import page
+from star import page, report
 from star.cli import main
 from star.config import ConfigError
 from star.loading import load, parse
@@ -161,7 +161,7 @@ def test_only_settings_that_differ_are_listed():
 
 def test_runs_of_the_same_name_are_told_apart_by_their_paths(make):
     paths = [make("a/run"), make("b/run"), make("c")]
-    assert page.names(paths) == [str(paths[0]), str(paths[1]), "c"]
+    assert report.labels(paths) == [str(paths[0]), str(paths[1]), "c"]
 
 
 def test_the_newest_small_film_is_shown_and_else_how_to_make_one(make, monkeypatch):

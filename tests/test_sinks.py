@@ -106,6 +106,16 @@ def test_tensorboard_keeps_pictures(tmp_path):
     assert shown[1].image.encoded_image_string == (tmp_path / "summary.png").read_bytes()
 
 
+def whole(path, *, seconds=30):
+    """All records of a run; W&B writes them in a process of its own, which may still be at it."""
+    until = time.monotonic() + seconds
+    while True:
+        records = list(logged(path))
+        if "exit" in {record.WhichOneof("record_type") for record in records} or time.monotonic() > until:
+            return records
+        time.sleep(0.1)
+
+
 def test_an_offline_run_of_wandb_goes_on_as_the_same_run_and_tells_nothing_twice(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setattr(sinks, "_PATIENCE_S", 300)
@@ -120,7 +130,7 @@ def test_an_offline_run_of_wandb_goes_on_as_the_same_run_and_tells_nothing_twice
             others.figures(run_dir / "figures")
     assert warned == []
     parts = sorted((run_dir / "wandb").glob("offline-run-*/*.wandb"), key=lambda path: path.stat().st_mtime)
-    told = [list(logged(path)) for path in parts]
+    told = [whole(path) for path in parts]
     runs = [next(r.run for r in records if r.WhichOneof("record_type") == "run") for records in told]
     assert len(runs) == 2 and runs[0].run_id == runs[1].run_id
     assert {(run.project, run.display_name) for run in runs} == {("star", "my_run")}

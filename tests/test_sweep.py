@@ -23,27 +23,16 @@ from star.config import ConfigError
 from star.loading import fields, kind, load, parse
 from star.study import Ledger, reason
 from star.sweep import open_ledger, plan, work
+from tests.small import EPOCH, RUN
 
 ROOT = Path(__file__).parents[1]
-EPOCH = 4 * 60  # env steps
-
-TINY = {
-    "env": {"name": "point_maze", "engine": "jax", "options": {"episode_length": 60}},
-    "commander": {"period": 20},
-    "tutor": {"unroll": 3, "ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
-    "controller": {"ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
-    "abstraction": {"max_regions": 8, "cuts": [[8.0], [8.0]]},
-    "forward_model": {"hidden": [8], "buffer_size": 64, "batch_size": 8, "updates_per_epoch": 2},
-    "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
-    "trainer": {"num_envs": 4, "total_env_steps": 4 * EPOCH, "eval_every": 2, "eval_episodes": 3},
-}
 
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A working directory with a config file."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(TINY))
+    (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(RUN))
     return tmp_path
 
 
@@ -112,20 +101,20 @@ def finished(path, make=Stub, *, out="out", **changes):
 
 def test_every_float_of_the_agent_may_differ_side_by_side_and_nothing_else():
     """What `structure` takes for equal is one jitted function; whatever else changes is another."""
-    base = parse(TINY)
+    base = parse(RUN)
     for key, _, _ in fields():
         if kind(key) is float:
-            other = parse(TINY, {key: 0.5 if key != "commander.goal_margin" else 2.0})
+            other = parse(RUN, {key: 0.5 if key != "commander.goal_margin" else 2.0})
             assert trainer.structure(other) == trainer.structure(base), key
         elif kind(key) is bool:
             values = base.model_dump(mode="json")
             for part in key.split(".")[:-1]:
                 values = values[part]
             with contextlib.suppress(ConfigError):  # some need others
-                flipped = parse(TINY, {key: not values[key.split(".")[-1]]})
+                flipped = parse(RUN, {key: not values[key.split(".")[-1]]})
                 assert trainer.structure(flipped) != trainer.structure(base), key
-    assert trainer.structure(parse(TINY, {"trainer.seed": 7})) == trainer.structure(base)
-    assert trainer.structure(parse(TINY, {"trainer.num_seeds": 7})) != trainer.structure(base)
+    assert trainer.structure(parse(RUN, {"trainer.seed": 7})) == trainer.structure(base)
+    assert trainer.structure(parse(RUN, {"trainer.num_seeds": 7})) != trainer.structure(base)
 
 
 def test_a_grid_tries_every_point_once_and_writes_down_which_is_best(folder, capsys, monkeypatch):

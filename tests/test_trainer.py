@@ -27,34 +27,17 @@ from star.config import ConfigError
 from star.loading import load, parse
 from star.metrics import Journal, JsonLines
 from star.sgim import teachers
+from tests.small import EPOCH, RUN
 
 ROOT = Path(__file__).parents[1]
 TIMES = ("wall_s", "env_steps_per_s")
-EPOCH = 4 * 60  # env steps
-
-TINY = {
-    "env": {"name": "point_maze", "engine": "jax", "options": {"episode_length": 60}},
-    "commander": {"period": 20},
-    "tutor": {"unroll": 3, "ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
-    "controller": {"ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
-    "abstraction": {"max_regions": 8, "cuts": [[8.0], [8.0]]},
-    "forward_model": {"hidden": [8], "buffer_size": 64, "batch_size": 8, "updates_per_epoch": 2},
-    "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
+TINY = RUN | {
     "sgim": {
         "goals": True,
         "strategies": ["autonomous", "babbling"],
         "teachers": [{"name": "guide", "kind": "decomposition", "max_queries": 3}],
     },
-    "trainer": {
-        "num_envs": 4,
-        "total_env_steps": 4 * EPOCH,
-        "eval_every": 2,
-        "eval_episodes": 3,
-        "checkpoint_every": 2,
-        "num_seeds": 2,
-        "keep_checkpoints": 3,
-        "sinks": ["tensorboard"],
-    },
+    "trainer": RUN["trainer"] | {"checkpoint_every": 2, "num_seeds": 2, "keep_checkpoints": 3},
 }
 
 

@@ -1,0 +1,14 @@
+"""A run on a maze small enough to train in a second."""
+
+EPOCH = 4 * 60  # env steps
+
+RUN = {
+    "env": {"name": "point_maze", "engine": "jax", "options": {"episode_length": 60}},
+    "commander": {"period": 20},
+    "tutor": {"unroll": 3, "ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
+    "controller": {"ppo": {"hidden": [8], "passes": 1, "minibatches": 1}},
+    "abstraction": {"max_regions": 8, "cuts": [[8.0], [8.0]]},
+    "forward_model": {"hidden": [8], "buffer_size": 64, "batch_size": 8, "updates_per_epoch": 2},
+    "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
+    "trainer": {"num_envs": 4, "total_env_steps": 4 * EPOCH, "eval_every": 2, "eval_episodes": 3},
+}
