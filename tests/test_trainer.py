@@ -37,7 +37,8 @@ TINY = RUN | {
         "strategies": ["autonomous", "babbling"],
         "teachers": [{"name": "guide", "kind": "decomposition", "max_queries": 3}],
     },
-    "trainer": RUN["trainer"] | {"checkpoint_every": 2, "num_seeds": 2, "keep_checkpoints": 3},
+    "trainer": RUN["trainer"]
+    | {"checkpoint_every": 2, "num_seeds": 2, "keep_checkpoints": 3, "sinks": ["tensorboard"]},
 }
 
 
