@@ -21,8 +21,9 @@ import jax
 import jax.numpy as jnp
 
 import envs
-from star import cli, hierarchy, refinement, trainer
+from star import cli, hierarchy, refinement
 from star import forward_model as models
+from star import program as programs
 from star.loading import load
 
 
@@ -37,9 +38,9 @@ def main() -> None:
 
 def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, Any]:
     """Time the parts of `epochs` epochs after one that warms up."""
-    program = trainer.build(load(path, overrides))
+    program = programs.build(load(path, overrides))
     config, agent = program.config, program.config.agent()
-    state = program.init(trainer.seed_keys(program))
+    state = program.init(program.seed_keys())
     steps = program.env_steps_per_epoch * len(program.seeds)
 
     compile_began = time.perf_counter()
@@ -74,7 +75,7 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
     }
 
 
-def _physics_speed(program: trainer.Program, seeds: int, steps: int = 200) -> float:
+def _physics_speed(program: programs.Program, seeds: int, steps: int = 200) -> float:
     """Env steps/s of the environment alone under random actions drawn in advance."""
     config = program.config
     env = envs.make(config.env.name, engine=config.env.engine, **config.env.options)

@@ -27,7 +27,8 @@ import jax
 import numpy as np
 import optuna
 
-from star import cli, trainer
+from star import cli
+from star.side_by_side import SideBySide
 from star.sweep import Plan, plan
 
 STAR = (sys.executable, "-m", "star.cli")
@@ -89,7 +90,7 @@ def _seconds(*arguments: Any) -> tuple[float, float]:
 
 def _warm(found: Plan, epochs: int = 3) -> dict[str, float]:
     """Seconds per trial and epoch of a program with one slot and of one with all, in turns; the fastest of each."""
-    benches = {slots: trainer.SideBySide(found.base, slots) for slots in (1, found.trials)}
+    benches = {slots: SideBySide(found.base, slots) for slots in (1, found.trials)}
     times: dict[int, list[float]] = {slots: [] for slots in benches}
     for slots, bench in benches.items():
         bench.put(dict.fromkeys(range(slots), found.base))

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from star import report, trainer
+from star import program as programs
+from star import report
 from star.loading import load
 from star.metrics import Journal
 
@@ -31,7 +32,7 @@ def main() -> None:
     rows = [row for row in rows if options.seed in (None, row["seed"])]
     if not rows:
         parser.error(f"{options.run}: holds no regions.jsonl with rows of the seed asked for")
-    walls = trainer.make_env(load(options.run / "config.yaml", {"env.engine": "auto"}), "test").arena.walls()
+    walls = programs.make_env(load(options.run / "config.yaml", {"env.engine": "auto"}), "test").arena.walls()
     out = options.out or options.run / "figures" / "growth.png"
     moments = options.at and [*options.at, np.inf]
     report.growth_figure(out, regions=rows, walls=np.asarray(walls), moments=moments)

@@ -1,6 +1,7 @@
 """Train and evaluate the agents of a results table, and draw their curves.
 
-    python scripts/reproduce.py TASK [NAME ...] [--seeds 5] [--level 0.9] [--one-by-one] [--out FOLDER] [-- SETTINGS]
+    python scripts/reproduce.py TASK [NAME ...] [--seed 0] [--seeds 5] [--level 0.9] [--one-by-one] [--out FOLDER]
+                                 [-- SETTINGS]
 
 TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents, configs/ablations or
 configs/sgim laid over it; by default all agents. SETTINGS are passed on to `star train`. For each name the seeds are
@@ -203,6 +204,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument("task")
     parser.add_argument("names", nargs="*", default=AGENTS)
+    parser.add_argument("--seed", type=int, default=0, help="first seed")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--level", type=float, default=LEVEL, help="of success_any, for the time to it")
@@ -228,7 +230,8 @@ def main(arguments: list[str] | None = None) -> None:
         level = report.get("level", LEVEL) if report else options.level
         if level != options.level:
             raise SystemExit(f"error: --level {options.level:g}: {path} was made with {level:g}")
-        missing = sorted(set(range(options.seeds)) - {seed["seed"] for seed in report.get("seeds", [])})
+        wanted = range(options.seed, options.seed + options.seeds)
+        missing = sorted(set(wanted) - {seed["seed"] for seed in report.get("seeds", [])})
         for seeds in groups(missing, one_by_one=options.one_by_one):
             measured = measure(options.task, name, seeds, options, settings)
             report, curve = summarise(options.task, name, report, measured, level=options.level)

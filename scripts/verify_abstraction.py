@@ -28,7 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.vector import VectorEnv
-from star import episode, forward_model, hierarchy, trainer
+from star import episode, forward_model, hierarchy
+from star import program as programs
+from star.checkpoint import load_state
 from star.commander import Decision, Successors
 from star.config import AgentConfig
 from star.loading import load
@@ -137,13 +139,13 @@ def main() -> None:
     options = parser.parse_args()
 
     config = load(options.run / "config.yaml", {"env.engine": "auto"})
-    program = trainer.build(config)
-    step, states = trainer.load_checkpoint(program, options.run, options.checkpoint)
+    program = programs.build(config)
+    step, states = load_state(program, options.run, options.checkpoint)
     agent, spec = program.config.agent(), program.spec
-    task = trainer.make_env(program.config, "train", start=options.start)
+    task = programs.make_env(program.config, "train", start=options.start)
     env = VectorEnv(task, options.episodes, auto_reset=False)
     roll = jax.jit(partial(rollouts, agent, spec, env))
-    keys = trainer.evaluation_keys(program, options.seed, stream=trainer.AFTERWARDS)
+    keys = program.evaluation_keys(options.seed, stream=programs.AFTERWARDS)
     rows = []
     for i, seed in enumerate(program.seeds):
         state = jax.tree.map(lambda x, i=i: x[i], states)

@@ -24,13 +24,14 @@ from rich.console import Console
 
 from envs import routes
 from envs.vector import VectorEnv
-from star import episode, evaluation, report, trainer
+from star import checkpoint, episode, evaluation, report
+from star import program as programs
 from star.checkpoint import Checkpoints, check_compatible
 from star.config import Config, ConfigError
 from star.evaluation import MEASURES, Trials
 from star.loading import parse
+from star.program import Program
 from star.spec import Spec
-from star.trainer import Program
 
 FAILED = 10  # episodes that failed, named for each seed
 ROWS = "evaluation.jsonl"
@@ -85,9 +86,9 @@ def prepare(config: Config, exam: Exam, *, episodes: int, source: Path) -> Cours
     Raises:
       ConfigError: in one line, if they cannot act there, or there are not as many episodes as goals.
     """
-    program = trainer.build(config)
+    program = programs.build(config)
     task = elsewhere(config, exam.task)
-    env = trainer.make_env(task, "test")
+    env = programs.make_env(task, "test")
     spec = _fitting(program, env, source=source)
     goals = cells = None
     if exam.grid is not None:
@@ -197,8 +198,8 @@ def evaluate(
         for number, entry in enumerate(entries):
             if status is not None:
                 status.update(f"checkpoint {number + 1} of {len(entries)}")
-            state = trainer.restore(entry.program, entry.checkpoints, entry.step, source=entry.run_dir)
-            keys = trainer.evaluation_keys(entry.program, exam.seed, stream=trainer.AFTERWARDS)
+            state = checkpoint.restore(entry.program, entry.checkpoints, entry.step, source=entry.run_dir)
+            keys = entry.program.evaluation_keys(exam.seed, stream=programs.AFTERWARDS)
             trials = jax.device_get(entry.play(entry.program.config.agent(), state, keys))
             rows.append(_row(entry, exam, trials, entry.shortest(trials)))
     return rows
@@ -230,17 +231,17 @@ def _plan(targets: Sequence[Target], exam: Exam, stack: contextlib.ExitStack) ->
     seen: set[tuple[Path, int]] = set()
     for target in targets:
         config, source = target.config, target.run_dir
-        checkpoints = stack.enter_context(trainer.opened(source))
+        checkpoints = stack.enter_context(checkpoint.opened(source))
         steps = checkpoints.steps()
         if target.checkpoint != "all" or not steps:
-            steps = [trainer.choose(checkpoints, source, target.checkpoint)]
+            steps = [checkpoint.choose(checkpoints, source, target.checkpoint)]
         structure = _structure(config)
         if structure not in courses:
             episodes = config.trainer.eval_episodes
             course = prepare(config, exam, episodes=episodes, source=source)
             courses[structure] = (course, player(course, episodes), {})
         course, play, ways = courses[structure]
-        own = trainer.resolve(config, course.program.config.env.engine, course.program.spec)
+        own = programs.resolve(config, course.program.config.env.engine, course.program.spec)
         program = dataclasses.replace(course.program, config=own)
         for step in steps:
             if (source.resolve(), step) not in seen:

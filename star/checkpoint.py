@@ -5,8 +5,9 @@ The latest few are kept and, besides, the one with the best evaluation.
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,10 @@ import jax.numpy as jnp
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
+from star import program as programs
 from star.config import Config, ConfigError
 from star.loading import fields, parse
+from star.program import Program
 from star.state import TrainState
 
 FORMAT = 2  # since `refinement.neighbours` and `refinement.parts`
@@ -120,6 +123,66 @@ class Checkpoints:
                 item_names=("state", "config"),
             )
         return self._manager
+
+
+def load_state(program: Program, run_dir: Path, wanted: str) -> tuple[int, TrainState]:
+    """(env steps, state of all seeds) of a checkpoint of `run_dir`: "last", "best" or its env steps."""
+    with opened(run_dir) as checkpoints:
+        step = choose(checkpoints, run_dir, wanted)
+        return step, restore(program, checkpoints, step, source=run_dir)
+
+
+@contextlib.contextmanager
+def opened(run_dir: Path) -> Iterator[Checkpoints]:
+    """The checkpoints of a run, closed again at the end."""
+    checkpoints = Checkpoints(run_dir)
+    try:
+        yield checkpoints
+    finally:
+        checkpoints.close()
+
+
+def choose(checkpoints: Checkpoints, run_dir: Path, wanted: str) -> int:
+    """Env steps of the checkpoint of `run_dir` that a user wants: "last", "best" or its env steps."""
+    steps = checkpoints.steps()
+    if not steps:
+        raise ConfigError(f"{run_dir}: holds no checkpoint")
+    if wanted == "last":
+        return steps[-1]
+    if wanted == "best":
+        return checkpoints.best()
+    if wanted.isdecimal() and int(wanted) in steps:
+        return int(wanted)
+    raise ConfigError(f"--checkpoint: {wanted!r} is not among last, best, {', '.join(map(str, steps))}")
+
+
+def restore(program: Program, checkpoints: Checkpoints, step: int, *, source: Path) -> TrainState:
+    """The state of all seeds in the checkpoint at `step`; raises `ConfigError` if it is none of `program`."""
+    check_compatible(checkpoints.config(step), program.config, source=source)
+    return checkpoints.restore(step, jax.eval_shape(program.init, program.seed_keys()))
+
+
+def load_agent(
+    config: Config, run_dir: Path, *, checkpoint: str, agent: int | None, seed: int
+) -> tuple[Program, TrainState, jax.Array]:
+    """The agent of seed `agent` (None: the first) in a checkpoint of `run_dir`, and the key of its episodes.
+
+    `seed` is the one that a user chose for the evaluation.
+    """
+    program = programs.build(config)
+    number = agent_number(program, run_dir, agent)
+    _, states = load_state(program, run_dir, checkpoint)
+    key = program.evaluation_keys(seed, stream=programs.AFTERWARDS)[number]
+    return program, jax.tree.map(lambda leaf: leaf[number], states), key
+
+
+def agent_number(program: Program, run_dir: Path, agent: int | None) -> int:
+    """Which of the agents of `run_dir` has the seed `agent` (None: the first)."""
+    if agent is None:
+        return 0
+    if agent not in program.seeds:
+        raise ConfigError(f"--seed: {agent} is not among those of {run_dir}: {', '.join(map(str, program.seeds))}")
+    return program.seeds.index(agent)
 
 
 def check_compatible(saved: Config, wanted: Config, *, source: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Float
@@ -181,3 +182,13 @@ def improvement(better: Scores, than: Scores) -> tuple[float, float, float] | No
         return float(np.mean([(np.sign(x[:, None] - y).mean() + 1) / 2 for x, y in pairs]))
 
     return stratified([group[task] for group in (better, than) for task in common], probability)
+
+
+def add_to(table: list[dict[str, Any]], episodes: Episode, *, where: np.ndarray | None = None) -> None:
+    """Add the statistics of `episodes` to the rows of `table`, or to those where the mask says so."""
+    host = jax.device_get(episodes)
+    for i, row in enumerate(table):
+        if where is not None and not where[i]:
+            continue
+        summary = summarise(jax.tree.map(lambda x, i=i: x[i], host))
+        row |= {f"eval/{name}": summary[name] for name in ("success_any", "success_final", "distance", "return")}

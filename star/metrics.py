@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from star.config import ConfigError
 
 
@@ -70,6 +72,12 @@ class Journal:
     def of(cls, run_dir: Path) -> Journal:
         """That of a run directory."""
         return cls(*(JsonLines(run_dir / f"{name}.jsonl") for name in ("metrics", "regions", "provenance")))
+
+
+def of_epoch(metrics: dict[str, jax.Array], seeds: list[int]) -> list[dict[str, Any]]:
+    """One row per seed of the `metrics` of an epoch, arrays with a leading axis of seeds."""
+    host = jax.device_get(metrics)
+    return [{"seed": seed} | {k: v[i].item() for k, v in host.items()} for i, seed in enumerate(seeds)]
 
 
 def by_step(rows: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:

@@ -26,7 +26,8 @@ import numpy as np
 from envs import files, video
 from envs.arena import ROBOT
 from envs.options import EnvError
-from star import evaluation, report, trainer
+from star import evaluation, report
+from star import program as programs
 from star.config import Config, ConfigError
 from star.metrics import Journal, JsonLines, by_step
 
@@ -75,7 +76,7 @@ def write(runs: Mapping[Path, Config], out: Path) -> str:
     Raises:
       ConfigError: in one line, if a run or `out` cannot be used; nothing is written then.
     """
-    trainer.select_device("cpu")  # a GPU may be busy with one of the runs
+    programs.select_device("cpu")  # a GPU may be busy with one of the runs
     try:
         found = [
             read(path, config, name=name)
@@ -232,7 +233,7 @@ def growth(run: Run, *, most: int = MAX_BOXES) -> dict[str, Any]:
     room. `chosen`, `visited` and `drawn` are shares in %, other tables are as in `regions.jsonl`.
     """
     config = run.config.model_copy(update={"env": run.config.env.model_copy(update={"engine": "auto"})})
-    env = trainer.make_env(config, "test")
+    env = programs.make_env(config, "test")
     robots = env.arena.centres(ROBOT)
     boxes: dict[tuple[float | None, ...], int] = {}
     frames: dict[int, list[dict[str, Any]]] = {seed: [] for seed in run.seeds}

@@ -13,7 +13,9 @@ from flax import struct
 from rich.console import Console
 
 from envs.vector import VectorEnv
-from star import episode, trainer
+from star import episode
+from star import program as programs
+from star.checkpoint import load_agent
 from star.config import Config, ConfigError
 from star.sgim import teachers
 from star.sgim.teachers import Demonstrations
@@ -67,8 +69,8 @@ def play(
     config: Config, run_dir: Path, *, checkpoint: str, agent: int | None, episodes: int, seed: int
 ) -> tuple[Moments, Spec]:
     """Greedy episodes on training goals, as NumPy arrays [T + 1, E, ...]; at the last moment nothing is done."""
-    program, state, key = trainer.load_agent(config, run_dir, checkpoint=checkpoint, agent=agent, seed=seed)
-    vector = VectorEnv(trainer.make_env(program.config, "train"), episodes, auto_reset=False)
+    program, state, key = load_agent(config, run_dir, checkpoint=checkpoint, agent=agent, seed=seed)
+    vector = VectorEnv(programs.make_env(program.config, "train"), episodes, auto_reset=False)
     spec = program.spec
 
     def look(env_state: Any) -> Moments:

@@ -23,8 +23,10 @@ from envs.options import EnvError
 from envs.render import FINE_SHADOWS, SHADOWS, Marks, Painter, Stage, aspect_of
 from envs.topdown import Sheet, tiled
 from envs.vector import VectorEnv
-from star import assessment, episode, trainer
+from star import assessment, episode
+from star import program as programs
 from star.assessment import Exam
+from star.checkpoint import agent_number, load_state
 from star.config import Config, ConfigError
 from star.tutor import Box
 
@@ -125,8 +127,8 @@ def render(
 
 def record_random(config: Config, *, envs: int, steps: int | None, seed: int) -> Recording:
     """Actions drawn uniformly from all possible ones."""
-    trainer.select_device(config.trainer.device)
-    env = trainer.make_env(config, "train")
+    programs.select_device(config.trainer.device)
+    env = programs.make_env(config, "train")
     vector = VectorEnv(env, envs, auto_reset=False)
     length = _length(env.episode_length, steps)
 
@@ -164,9 +166,9 @@ def record_run(
     course = assessment.prepare(config, exam, episodes=episodes, source=run_dir)
     program, env, spec = course.program, course.env, course.spec
     length = _length(spec.episode_length, steps)
-    index = trainer.agent_number(program, run_dir, agent)
-    _, states = trainer.load_checkpoint(program, run_dir, checkpoint)
-    keys = trainer.evaluation_keys(program, exam.seed, stream=trainer.AFTERWARDS)
+    index = agent_number(program, run_dir, agent)
+    _, states = load_state(program, run_dir, checkpoint)
+    keys = program.evaluation_keys(exam.seed, stream=programs.AFTERWARDS)
     shown = slice(0, envs) if number is None else slice(number, number + 1)
     if number is None:
         states, keys = jax.tree.map(lambda leaf: leaf[index : index + 1], (states, keys))

@@ -31,12 +31,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from envs import EnvError, files
+from star import program as programs
 from star import sweep_report, trainer
 from star.config import Config, ConfigError, Positive
 from star.loading import check_setting, explain, kind, load, parse, read_file
 from star.metrics import mean
+from star.side_by_side import SideBySide
 from star.study import MEASURED, Holding, Ledger, product, reachable, reason
-from star.trainer import SideBySide
 
 _WAIT_S = 2.0  # between looks at what other workers do
 _MEASURES = ("success_any", "success_final")
@@ -129,7 +130,7 @@ class Sweep(_Model):
 
 
 class Bench(Protocol):
-    """What trains a batch of trials: `star.trainer.SideBySide`."""
+    """What trains a batch of trials: `star.SideBySide`."""
 
     slots: int
     epochs: int
@@ -208,8 +209,8 @@ def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: An
         for value in parameter.ends:
             check_setting(base, key, value, source=f"{path}: parameters")
             if key.startswith("env."):
-                trainer.build(parse(base.model_dump(mode="json"), {key: value}, source=f"{path}: parameters"))
-    program = trainer.build(base)
+                programs.build(parse(base.model_dump(mode="json"), {key: value}, source=f"{path}: parameters"))
+    program = programs.build(base)
     evaluations = -(-program.epochs // base.trainer.eval_every)
     distributions = {key: _distribution(key, one, source=path) for key, one in sweep.parameters.items()}
     return Plan(sweep.study or path.stem, sweep, base, distributions, evaluations)
@@ -345,7 +346,7 @@ class _Worker:
 
     def run_batch(self) -> None:
         """Train the queued trials that have the structure of the first, and such as come until there are too few."""
-        shared = trainer.structure(self.queue[0].config)
+        shared = programs.structure(self.queue[0].config)
         slots = dict(enumerate(self._from_queue(shared)))
         self.display.update(status=f"compiling for {len(slots)} trials side by side")
         try:
@@ -377,7 +378,7 @@ class _Worker:
         """Put queued trials into empty slots; but a few alone had better have a program of their own size."""
         self.take()
         free = [slot for slot in range(bench.slots) if slot not in slots]
-        fitting = [one for one in self.queue if trainer.structure(one.config) == shared]
+        fitting = [one for one in self.queue if programs.structure(one.config) == shared]
         if not slots and 2 * len(fitting) < bench.slots:
             return
         new = dict(zip(free, self._from_queue(shared, at_most=len(free)), strict=False))
@@ -417,7 +418,7 @@ class _Worker:
 
     def _from_queue(self, shared: str, at_most: int | None = None) -> list[_Run]:
         """Take trials of this structure out of the queue."""
-        taken = [one for one in self.queue if trainer.structure(one.config) == shared][:at_most]
+        taken = [one for one in self.queue if programs.structure(one.config) == shared][:at_most]
         self.queue = [one for one in self.queue if one not in taken]
         return taken
 

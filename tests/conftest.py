@@ -23,7 +23,8 @@ import star.state  # noqa: E402
 from envs import opengl  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
-from star import episode, hierarchy, loading, trainer  # noqa: E402
+from star import episode, hierarchy, loading  # noqa: E402
+from star import program as programs  # noqa: E402
 from star.checkpoint import Checkpoints  # noqa: E402
 from star.spec import Spec
 
@@ -110,8 +111,8 @@ def run(tmp_path_factory):
     """A run directory with one checkpoint of agents that have learnt nothing but move, of the seeds 5 and 6."""
     run_dir = tmp_path_factory.mktemp("runs") / "new"
     run_dir.mkdir()
-    program = trainer.build(loading.parse(UNTRAINED))
-    state = program.init(trainer.seed_keys(program))
+    program = programs.build(loading.parse(UNTRAINED))
+    state = program.init(program.seed_keys())
     strong = jax.tree.map(lambda x: 30 * x, state.controller.params)
     state = state.replace(controller=state.controller.replace(params=strong))
     (run_dir / "config.yaml").write_text(program.config.to_yaml())

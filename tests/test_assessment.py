@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import assessment, cli, episode, loading, rendering, report, trainer
+from star import assessment, cli, episode, loading, rendering, report
+from star import program as programs
 from star.assessment import Exam, Target
-from star.checkpoint import Checkpoints
+from star.checkpoint import Checkpoints, load_state
 from star.episode import Episode
 
 GRID = Exam(grid=2, seed=1)
@@ -30,9 +31,9 @@ def still(run, tmp_path_factory):
     copy = tmp_path_factory.mktemp("runs") / "still"
     copy.mkdir()
     overrides = {"trainer.seed": 8, "commander.discount": 0.5, "trainer.eval_episodes": EPISODES}
-    program = trainer.build(loading.load(run / "config.yaml", overrides))
+    program = programs.build(loading.load(run / "config.yaml", overrides))
     (copy / "config.yaml").write_text(program.config.to_yaml())
-    state = trainer.load_checkpoint(trainer.build(loading.load(run / "config.yaml")), run, "last")[1]
+    state = load_state(programs.build(loading.load(run / "config.yaml")), run, "last")[1]
     checkpoints = Checkpoints(copy)
     checkpoints.save(160, state, program.config, success=1.0)
     weak = jax.tree.map(lambda x: 0 * x, state.controller.params)

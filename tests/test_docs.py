@@ -13,6 +13,7 @@ import envs
 from envs import opengl
 from envs.tasks import TASKS
 from star import assessment, cli, record, rendering, sweep, tables, trainer
+from star import program as programs
 from star.cli import main
 from star.config import Config
 from star.loading import fields, parse
@@ -103,16 +104,16 @@ def test_the_commands_of_the_tutorial_work_as_they_are_but_smaller(run, tmp_path
     shutil.copytree(run, tmp_path / "runs" / "quickstart")  # of step 1
     for name, text in files("docs/tutorial.md").items():
         (tmp_path / name).write_text(text)
-    build, programs = trainer.build, {}
+    build, known = programs.build, {}
 
     def shared(config):
         """What trains, goes on and is evaluated is the same program: it is compiled once."""
         endless = config.model_copy(update={"trainer": config.trainer.model_copy(update=ENDLESS)})
-        program = programs.setdefault(trainer.structure(endless), build(config))
-        resolved = trainer.resolve(config, program.config.env.engine, program.spec)
+        program = known.setdefault(programs.structure(endless), build(config))
+        resolved = programs.resolve(config, program.config.env.engine, program.spec)
         return dataclasses.replace(program, config=resolved, agent=resolved.agent())
 
-    monkeypatch.setattr(trainer, "build", shared)
+    monkeypatch.setattr(programs, "build", shared)
     try:
         opengl.backend()
         drawn = ()
@@ -221,8 +222,8 @@ def test_departures_name_the_settings_and_their_defaults():
     ],
 )
 def test_every_metric_is_explained_and_every_explained_metric_exists(overrides):
-    program = trainer.build(parse({"env": {"name": "point_maze"}, "trainer": {"num_envs": 8}}, overrides))
-    state = jax.eval_shape(program.init, trainer.seed_keys(program))
+    program = programs.build(parse({"env": {"name": "point_maze"}, "trainer": {"num_envs": 8}}, overrides))
+    state = jax.eval_shape(program.init, program.seed_keys())
     metrics = set(jax.eval_shape(program.epoch, state)[1])
     learner = {"PPO", "both"} if not overrides else {"TD3", "both"}
     explained = {

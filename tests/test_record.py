@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from envs.point import PointState
-from star import cli, record, trainer
+from star import cli, record
+from star import program as programs
 from star.loading import load
 from star.record import Moments
 from star.sgim import teachers
@@ -24,7 +25,7 @@ def recorded(run, tmp_path_factory):
     out = tmp_path_factory.mktemp("recorded") / "demos.npz"
     config = load(run / "config.yaml")
     said = record.record(config, run, out, episodes=EPISODES, agent=6, seed=1, quiet=True)
-    env = trainer.make_env(config, "train")
+    env = programs.make_env(config, "train")
     return said, jax.tree.map(np.asarray, teachers.load(out, env="point_maze", spec=Spec.of(env))), env
 
 

@@ -10,7 +10,8 @@ import pytest
 
 import star.state
 from envs.arena import Arena
-from star import loading, trainer
+from star import loading
+from star import program as programs
 from star.commander import Decision
 from star.evaluation import bootstrap
 from star.forward_model import Outcome
@@ -58,7 +59,7 @@ def test_the_benchmark_measures_both_loops():
 
 def test_the_benchmark_of_an_epoch_calls_its_parts_as_they_are(run, monkeypatch):
     script = load("benchmark_epoch")
-    build, timed = trainer.build, []
+    build, timed = programs.build, []
 
     def seconds(function, *arguments):
         timed.append(jax.eval_shape(function, *arguments))  # traced, not compiled
@@ -71,7 +72,7 @@ def test_the_benchmark_of_an_epoch_calls_its_parts_as_they_are(run, monkeypatch)
         program = build(config)
         return dataclasses.replace(program, functions=dataclasses.replace(program.functions, epoch=still))
 
-    monkeypatch.setattr(trainer, "build", without_epoch)
+    monkeypatch.setattr(programs, "build", without_epoch)
     row = script.benchmark(run / "config.yaml", 1, {})
     assert row["physics_env_steps_per_s"] == 200 * 4 * 2 / 0.5 and len(timed) == 3
     assert row["refinement_share"] == row["forward_model_share"] == 0.5 / row["epoch_s"]

@@ -18,7 +18,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from star import cli, sweep, trainer
+from star import cli, sweep
+from star import program as programs
 from star.config import ConfigError
 from star.loading import fields, kind, load, parse
 from star.study import Ledger, reason
@@ -105,16 +106,16 @@ def test_every_float_of_the_agent_may_differ_side_by_side_and_nothing_else():
     for key, _, _ in fields():
         if kind(key) is float:
             other = parse(RUN, {key: 0.5 if key != "commander.goal_margin" else 2.0})
-            assert trainer.structure(other) == trainer.structure(base), key
+            assert programs.structure(other) == programs.structure(base), key
         elif kind(key) is bool:
             values = base.model_dump(mode="json")
             for part in key.split(".")[:-1]:
                 values = values[part]
             with contextlib.suppress(ConfigError):  # some need others
                 flipped = parse(RUN, {key: not values[key.split(".")[-1]]})
-                assert trainer.structure(flipped) != trainer.structure(base), key
-    assert trainer.structure(parse(RUN, {"trainer.seed": 7})) == trainer.structure(base)
-    assert trainer.structure(parse(RUN, {"trainer.num_seeds": 7})) != trainer.structure(base)
+                assert programs.structure(flipped) != programs.structure(base), key
+    assert programs.structure(parse(RUN, {"trainer.seed": 7})) == programs.structure(base)
+    assert programs.structure(parse(RUN, {"trainer.num_seeds": 7})) != programs.structure(base)
 
 
 def test_a_grid_tries_every_point_once_and_writes_down_which_is_best(folder, capsys, monkeypatch):
@@ -211,7 +212,7 @@ def test_more_trials_can_be_asked_for_later(folder):
 def test_every_shipped_sweep_is_valid_and_trains_side_by_side(path):
     found = plan(path)
     ends = [{key: one.ends[end] for key, one in found.file.parameters.items()} for end in (0, -1)]
-    assert len({trainer.structure(found.config(values)) for values in ends}) == 1
+    assert len({programs.structure(found.config(values)) for values in ends}) == 1
 
 
 @pytest.mark.parametrize(

@@ -22,11 +22,13 @@ import yaml
 
 import envs
 from star import cli, report, trainer
-from star.checkpoint import Checkpoints
+from star import program as programs
+from star.checkpoint import Checkpoints, check_compatible
 from star.config import ConfigError
 from star.loading import load, parse
 from star.metrics import Journal, JsonLines
 from star.sgim import teachers
+from star.side_by_side import SideBySide
 from tests.small import EPOCH, RUN
 
 ROOT = Path(__file__).parents[1]
@@ -51,9 +53,9 @@ def rows(run_dir):
 
 
 def saved_state(config, run_dir):
-    program = trainer.build(config)
+    program = programs.build(config)
     checkpoints = Checkpoints(run_dir)
-    state = checkpoints.restore(checkpoints.steps()[-1], jax.eval_shape(program.init, trainer.seed_keys(program)))
+    state = checkpoints.restore(checkpoints.steps()[-1], jax.eval_shape(program.init, program.seed_keys()))
     checkpoints.close()
     return jax.tree.map(np.asarray, state.replace(key=jax.random.key_data(state.key)))
 
@@ -61,19 +63,19 @@ def saved_state(config, run_dir):
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once():
     """Compiling takes nearly all the time of these tests, and a program has no state: configs of a structure share."""
-    build, programs = trainer.build, {}
+    build, known = programs.build, {}
 
     def shared(config):
-        key = trainer.structure(config)
-        if key not in programs:
-            programs[key] = build(config)
-        program = programs[key]
-        resolved = trainer.resolve(config, program.config.env.engine, program.spec)
+        key = programs.structure(config)
+        if key not in known:
+            known[key] = build(config)
+        program = known[key]
+        resolved = programs.resolve(config, program.config.env.engine, program.spec)
         return dataclasses.replace(program, config=resolved, agent=resolved.agent())
 
-    trainer.build = shared
+    programs.build = shared
     yield
-    trainer.build = build
+    programs.build = build
 
 
 @pytest.fixture(scope="module")
@@ -221,14 +223,14 @@ def test_metrics_written_after_the_checkpoint_are_dropped_on_resume(finished, tm
 
 
 def test_auto_engine_and_the_cuts_of_the_task_are_resolved():
-    config = trainer.build(tiny(env__engine="auto", abstraction__cuts=None)).config
+    config = programs.build(tiny(env__engine="auto", abstraction__cuts=None)).config
     assert config.env.engine == "jax"
     assert config.abstraction.cuts == ((8.0,), (8.0,))
 
 
 def test_nothing_is_compiled_after_the_first_epoch(caplog):
-    program = trainer.build(tiny())
-    start = jax.device_put(program.init(trainer.seed_keys(program)), jax.devices()[0])  # as `train` does
+    program = programs.build(tiny())
+    start = jax.device_put(program.init(program.seed_keys()), jax.devices()[0])  # as `train` does
     state, _ = program.epoch(start)
     with jax.log_compiles(True), caplog.at_level("WARNING"):
         state, _ = program.epoch(state)
@@ -276,7 +278,7 @@ def test_a_checkpoint_loads_on_a_machine_without_the_device_it_was_saved_on(tmp_
     saving = """
 import sys, jax, jax.numpy as jnp
 from pathlib import Path
-from star.checkpoint import Checkpoints
+from star.checkpoint import Checkpoints, check_compatible
 from star.config import Config
 state = {"x": jax.device_put(jnp.arange(3.0), jax.devices()[1])}
 checkpoints = Checkpoints(Path(sys.argv[1]))
@@ -293,9 +295,7 @@ checkpoints.close()
 def test_a_numeric_hyperparameter_and_the_sinks_may_change_on_resume(finished, tmp_path):
     run_dir, _ = finished
     checkpoints = Checkpoints(run_dir)
-    trainer.check_compatible(
-        checkpoints.config(2 * EPOCH), tiny(tutor__reward_scale=3.0, trainer__sinks=[]), source=run_dir
-    )
+    check_compatible(checkpoints.config(2 * EPOCH), tiny(tutor__reward_scale=3.0, trainer__sinks=[]), source=run_dir)
     checkpoints.close()
 
 
@@ -322,8 +322,8 @@ def test_ctrl_c_writes_a_checkpoint_and_says_how_to_resume(tmp_path):
 
 
 def test_only_the_latest_checkpoints_and_the_best_are_kept(tmp_path):
-    program = trainer.build(tiny())
-    state = program.init(trainer.seed_keys(program))
+    program = programs.build(tiny())
+    state = program.init(program.seed_keys())
     checkpoints = Checkpoints(tmp_path, keep=2)
     for step, success in ((1, 0.1), (2, 0.9), (3, 0.2), (4, 0.3), (5, 0.4)):
         checkpoints.save(step, state, program.config, success=success)
@@ -373,8 +373,8 @@ def test_runs_side_by_side_are_each_what_train_makes_of_them(finished, tmp_path)
         "trainer__seed": 3,
     }
     usual, other = tiny(), tiny(**numbers)
-    assert trainer.structure(usual) == trainer.structure(other) != trainer.structure(tiny(trainer__num_envs=8))
-    bench = trainer.SideBySide(usual, 2)
+    assert programs.structure(usual) == programs.structure(other) != programs.structure(tiny(trainer__num_envs=8))
+    bench = SideBySide(usual, 2)
     bench.put({0: tiny(commander__discount=0.1), 1: other})
     rows_of = [[], []]
     for epoch in range(6):
@@ -392,7 +392,7 @@ def test_runs_side_by_side_are_each_what_train_makes_of_them(finished, tmp_path)
 
 def interrupt_after(monkeypatch, *, epochs):
     """Press Ctrl-C during epoch number `epochs`."""
-    build = trainer.build
+    build = programs.build
 
     def pressing(config):
         program = build(config)
@@ -406,7 +406,7 @@ def interrupt_after(monkeypatch, *, epochs):
 
         return dataclasses.replace(program, functions=dataclasses.replace(program.functions, epoch=epoch))
 
-    monkeypatch.setattr(trainer, "build", pressing)
+    monkeypatch.setattr(programs, "build", pressing)
 
 
 def assert_equal(one, other):
