@@ -28,8 +28,16 @@ def here() -> dict[str, Any]:
         "commit": _commit(),
         "device": device.device_kind if device.platform == "gpu" else f"CPU, {cores} core{'s' * (cores > 1)}",
         "python": platform.python_version(),
-        "versions": {name: metadata.version(name) for name in _PACKAGES},
+        "versions": {name: _version(name) for name in _PACKAGES},
     }
+
+
+def _version(package: str) -> str | None:
+    """None for a package that is there but not installed, as in a checkout that runs as it is."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def _commit() -> str:

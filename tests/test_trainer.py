@@ -21,7 +21,7 @@ import pytest
 import yaml
 
 import envs
-from star import cli, report, trainer
+from star import cli, provenance, report, trainer
 from star import program as programs
 from star.checkpoint import Checkpoints, check_compatible
 from star.config import ConfigError
@@ -411,3 +411,8 @@ def interrupt_after(monkeypatch, *, epochs):
 
 def assert_equal(one, other):
     jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_a_checkout_that_is_not_installed_says_where_it_runs_all_the_same(monkeypatch):
+    monkeypatch.setattr(provenance, "_PACKAGES", ("jax", "no-such-package"))
+    assert provenance.here()["versions"] == {"jax": jax.__version__, "no-such-package": None}
