@@ -57,14 +57,14 @@ class Browser:
                 return message["result"]
             self._note(message)
 
-    def open(self, path, *, width=1280, height=900, dark=False):
-        """Open a file, and wait until it is drawn."""
+    def open(self, page, *, width=1280, height=900, dark=False):
+        """Open a file or an address, and wait until it is drawn."""
         self.problems, self.requests = [], []
         phone = width < 600
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
         scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.send("Emulation.setEmulatedMedia", features=scheme)
-        self.send("Page.navigate", url=path.absolute().as_uri())
+        self.send("Page.navigate", url=page if isinstance(page, str) else page.absolute().as_uri())
         _wait(lambda: {True: True}[self.run("document.readyState === 'complete' && !!document.querySelector('svg')")])
         self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
 
