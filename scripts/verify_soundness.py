@@ -7,7 +7,7 @@
     verdicts    of all ordered pairs of regions of the last checkpoint of each RUN and seed: all corners and so many
                 random points of each part that the full recursion judged REACHES, through the forward model
         strict      with `refinement.reach_share` 1: how many of them do not arrive in the target region
-        run         with that of the run, which lets a share of the hull lie beside the target: how many images are
+        trained     with that of the run, which lets a share of the hull lie beside the target: how many images are
                     outside of the hull, and `arrive`, the share of points that reach the target
 
 Exits with 1 if any image is outside, or any point under the strict verdict does not arrive. There is no tolerance
@@ -156,13 +156,16 @@ def check_verdicts(config: AgentConfig, state: TrainState, *, points: int, seed:
     count = int(state.abstraction.count)
     pairs = np.array([(i, j) for i, j in product(range(count), repeat=2) if i != j], np.int32)
     row: dict[str, Any] = {"regions": count, "pairs": len(pairs)}
-    for name, share in (("strict", 1.0), ("run", config.refinement.reach_share)):
+    judge = jax.jit(lambda *arguments: _judge(*arguments))
+    for name, share in (("strict", 1.0), ("trained", config.refinement.reach_share)):
         parts, outside, away, tested, nearest = 0, 0, 0, 0, np.inf
-        for (_, target), leaves, low, high in zip(pairs, *_judged(config, state, pairs, share), strict=True):
-            for n in np.flatnonzero(leaves.reaches):
+        leaves, lows, highs = jax.tree.map(np.asarray, judge(config, state, pairs, share))
+        for i, (_, target) in enumerate(pairs):
+            parts_of = jax.tree.map(lambda x, i=i: x[i], leaves)
+            for n in np.flatnonzero(parts_of.reaches):
                 rng = np.random.default_rng((seed, parts))
-                image = _images(config, state, target, leaves.lower[n], leaves.upper[n], points, rng)
-                margin = margins(low[n], high[n], image)
+                image = _images(config, state, target, parts_of.lower[n], parts_of.upper[n], points, rng)
+                margin = margins(lows[i, n], highs[i, n], image)
                 wanted = np.asarray(state.abstraction.lower[target]), np.asarray(state.abstraction.upper[target])
                 away += int((~((wanted[0] <= image) & (image <= wanted[1])).all(axis=-1)).sum())
                 outside, nearest = outside + int((margin < 0).sum()), min(nearest, float(margin.min()))
@@ -173,8 +176,8 @@ def check_verdicts(config: AgentConfig, state: TrainState, *, points: int, seed:
     return row
 
 
-def _judged(config: AgentConfig, state: TrainState, pairs: np.ndarray, share: float) -> Any:
-    """The parts of each pair that the recursion ends with, and their hulls (low, high)."""
+def _judge(config: AgentConfig, state: TrainState, pairs: jax.Array, share: jax.Array) -> Any:
+    """The parts that the recursion ends with for each pair, and their hulls (low, high)."""
     starts, seen = forward_model.visited(state.forward_model)
     settings = config.refinement
 
@@ -196,9 +199,7 @@ def _judged(config: AgentConfig, state: TrainState, pairs: np.ndarray, share: fl
         )
         return leaves, *jax.vmap(partial(reachability.hull, network))(leaves.lower, leaves.upper)
 
-    leaves, low, high = jax.tree.map(np.asarray, jax.jit(partial(jax.lax.map, one))(jnp.asarray(pairs)))
-    each = [jax.tree.map(lambda x, i=i: x[i], leaves) for i in range(len(pairs))]
-    return each, low, high
+    return jax.lax.map(one, jnp.asarray(pairs))
 
 
 def _images(
@@ -246,7 +247,7 @@ def main(arguments: list[str] | None = None) -> int:
         options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     bad = report["triples"]["outside"] + sum(
-        row["strict"]["do_not_arrive"] + row["strict"]["outside_hull"] + row["run"]["outside_hull"]
+        row["strict"]["do_not_arrive"] + row["strict"]["outside_hull"] + row["trained"]["outside_hull"]
         for row in report["verdicts"]
     )
     return int(bad > 0)
