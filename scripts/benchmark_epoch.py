@@ -55,7 +55,7 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
     fresh = jax.tree.map(
         lambda x: x[:, 0, : min(x.shape[2], program.config.trainer.num_envs * 16)], state.forward_model.ring.experience
     )
-    goals = refinement.Goals.of(fresh, jnp.ones_like(fresh.weight), radius=program.spec.success_radius)
+    goals = refinement.Goals.of(fresh, jnp.ones_like(fresh.weight, bool), radius=program.spec.success_radius)
     keys = jax.random.split(jax.random.key(0), len(program.seeds))
     refine = jax.jit(jax.vmap(lambda s, g, k: hierarchy.refine(agent, program.spec, s, g, key=k)))
     train = jax.jit(jax.vmap(lambda s, f, k: models.train(agent.forward_model, s, f, key=k)))

@@ -67,7 +67,7 @@ def observe(
     config: AdjacencyConfig,
     state: AdjacencyState,
     space: tuple[tuple[float, ...], tuple[float, ...]],
-    path: Float[Array, "l+1 B d"],
+    path: Float[Array, "states B d"],
     alive: Float[Array, "l B"],
 ) -> AdjacencyState:
     """Cells that an agent visited within the same l env steps are adjacent; `alive` masks steps after its end."""

@@ -31,6 +31,8 @@ _HARMLESS = (
     "trainer.eval_",
     "trainer.checkpoint_",
     "trainer.keep_",
+    "trainer.on_non_finite",
+    "trainer.rollbacks",
     "trainer.sinks",
 )
 

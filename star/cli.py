@@ -9,13 +9,16 @@ import sys
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import yaml
 from rich.console import Console
 
-from star.config import Config, ConfigError
+from star.config import Config, ConfigError, TrainerConfig
 from star.loading import fields, load, parse, read_yaml
+
+if TYPE_CHECKING:
+    from star.trainer import Result
 
 _HELP = """\
 Train a three-level agent (Commander, Tutor, Controller) whose goal regions refine themselves.
@@ -64,7 +67,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code: 0 done, 2 bad input, 130 interrupted."""
+    """Run the command; returns the exit code: 0 done, 2 bad input, 3 numbers not finite, 130 interrupted."""
     try:
         return _run(sys.argv[1:] if arguments is None else list(arguments))
     except ConfigError as error:
@@ -110,6 +113,9 @@ def _parser() -> argparse.ArgumentParser:
         default=0,
         metavar="EPOCHS",
         help="trace so many epochs after compilation (default: 1) with JAX's profiler, to RUN/profile",
+    )
+    train.add_argument(
+        "--debug", action="store_true", help="stop at the first NaN with a Python traceback, and check shapes; slow"
     )
     train.add_argument("--quiet", action="store_true", help="no progress")
     train.set_defaults(function=_train)
@@ -275,11 +281,21 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         name = "-".join(file.stem for file in (options.config, *options.layers))
         run_dir = options.run_dir or Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
 
+    if options.debug:
+        if config.sgim.enabled:
+            raise ConfigError("--debug: does not go with sgim, which writes NaN for what it does not know yet")
+        from star import debugging
+
+        debugging.turn_on()
+
     from star import trainer
 
     result = trainer.train(
         config, run_dir, resume=options.resume is not None, quiet=options.quiet, profile=options.profile
     )
+    if result.fault is not None:
+        print(f"stopped: {result.fault}; {_after_a_fault(result, config.trainer)}", file=sys.stderr)
+        return 3
     if result.interrupted:
         print(f"interrupted at {result.env_steps:,} env steps; go on with: star train --resume {run_dir}")
         return 130
@@ -287,6 +303,19 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     print(f"trained {result.env_steps:,} env steps{success}")
     print(f"figure:  {run_dir}/figures/summary.png\nmetrics: {run_dir}/metrics.jsonl\nnext:    star evaluate {run_dir}")
     return 0
+
+
+def _after_a_fault(result: Result, config: TrainerConfig) -> str:
+    """What is left of a run whose numbers were not finite, and how to go on."""
+    flags = "--trainer.on_non_finite rollback"
+    if config.on_non_finite == "rollback":
+        flags += f" --trainer.rollbacks {2 * config.rollbacks}"
+    if result.saved is None:
+        return f"there is no checkpoint from before; begin anew with {flags}"
+    return (
+        f"the checkpoint of {result.saved:,} env steps is sound; "
+        f"go on with: star train --resume {result.run_dir} {flags}"
+    )
 
 
 def _sweep(options: argparse.Namespace, overrides: dict[str, Any]) -> int:

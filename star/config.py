@@ -414,6 +414,14 @@ class TrainerConfig(Section):
     eval_episodes: Positive = Field(100, description="episodes of each evaluation, per seed")
     checkpoint_every: Positive = Field(5, description="epochs between checkpoints")
     keep_checkpoints: Positive = Field(3, description="latest checkpoints kept, besides the best")
+    on_non_finite: Literal["stop", "rollback"] = Field(
+        "stop",
+        description="when a number is NaN or infinite: stop, or go on from the last checkpoint with smaller steps",
+    )
+    rollback_factor: float = Field(
+        0.5, gt=0, lt=1, description="on_non_finite rollback: on all learning rates of the seed, each time"
+    )
+    rollbacks: Positive = Field(3, description="on_non_finite rollback: of one seed, before the run stops after all")
     device: Literal["auto", "cpu", "gpu"] = Field("auto", description="where to train")
     sinks: tuple[Literal["tensorboard", "wandb"], ...] = Field(
         (), description="where metrics go besides metrics.jsonl: tensorboard, wandb"

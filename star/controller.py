@@ -23,7 +23,7 @@ from star.config import ControllerConfig
 
 def observe(
     state: Float[Array, "*batch state"], subgoal: Float[Array, "*batch m"], *, position: Sequence[int]
-) -> Float[Array, "*batch state-p+m"]:
+) -> Float[Array, "*batch seen"]:
     """The state without its coordinates `position`, followed by the relative subgoal."""
     kept = np.setdiff1d(np.arange(state.shape[-1]), np.asarray(position, int))
     return jnp.concatenate([state[..., kept], subgoal], axis=-1)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from star import replay
 from star.config import ForwardModelConfig
 from star.networks import MLP, apply, descend
-from star.reachability import Network
+from star.reachability import ROUNDING, Network
 
 Metrics = dict[str, Array]
 
@@ -79,17 +79,26 @@ def predict(
 def network(
     config: ForwardModelConfig, state: ForwardModelState, lower: Float[Array, "d"], upper: Float[Array, "d"]
 ) -> Network:
-    """The model for one commanded box as a plain ReLU network of the start state, in the units of the state."""
+    """The model for one commanded box as a plain ReLU network of the start state, in the units of the state.
+
+    Scaling and command are folded into its first and last layer; `doubt` bounds what that rounds.
+    """
     middle, half = _scaling(state.space)
     dense = state.params["params"]
     layers = [(dense[f"Dense_{i}"]["kernel"].T, dense[f"Dense_{i}"]["bias"]) for i in range(len(dense))]
     d = middle.shape[0]
-    (first, bias), (last, last_bias) = layers[0], layers[-1]
     command = jnp.concatenate([(lower - middle) / half, (upper - middle) / half])
     product = partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+    first, bias = layers[0]
     layers[0] = (first[:, :d] / half, bias + product(first[:, d:], command) - product(first[:, :d], middle / half))
+    last, last_bias = layers[-1]
     layers[-1] = (last * half[:, None], last_bias * half + (0.0 if config.residual else middle))
-    return Network(layers=tuple(layers), residual=config.residual)
+    shift = jnp.abs(middle) / half
+    terms = jnp.abs(bias) + product(jnp.abs(first), jnp.concatenate([shift, jnp.abs(command) + jnp.tile(shift, 2)]))
+    doubt = [jnp.zeros_like(b) for _, b in layers]
+    doubt[0] += (2 * d + 4) * ROUNDING * terms
+    doubt[-1] = half * doubt[-1] + 4 * ROUNDING * (jnp.abs(last_bias) * half + jnp.abs(middle))
+    return Network(layers=tuple(layers), residual=config.residual, doubt=tuple(doubt))
 
 
 def errors(config: ForwardModelConfig, state: ForwardModelState, batch: Outcome) -> Float[Array, "*N"]:

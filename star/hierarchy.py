@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from envs.vector import VectorEnv
 from star import abstraction as regions
-from star import adjacency, commander, controller, episode, forward_model, learner, refinement, tutor
+from star import adjacency, commander, controller, episode, faults, forward_model, learner, refinement, tutor
 from star.commander import CommanderState, Decision, Successors
 from star.config import AgentConfig
 from star.episode import Episode, Steps, Streams
@@ -73,7 +73,8 @@ def epoch(
         epsilon = commander.epsilon(config.commander, _env_steps(spec, env, state))
         state, more = _learn_between_episodes(config, spec, state, outcomes, env.num_envs, key=end_key)
         metrics |= more | {"commander/epsilon": epsilon}
-    return state.replace(epoch=state.epoch + 1), metrics
+    state = state.replace(epoch=state.epoch + 1)
+    return state, metrics | faults.count(state)
 
 
 def _begin_lesson(
@@ -239,6 +240,7 @@ def _segment(
             ("terminated", steps.terminated),
             ("non_finite", steps.non_finite),
             ("overflow", steps.overflow),
+            ("obs_non_finite", ~(jnp.isfinite(steps.obs) & jnp.isfinite(steps.next_obs)).all(axis=-1)),
         )
     }
     streams = episode.restart_ended(spec, env, streams, steps, key=reset_key)

@@ -60,18 +60,20 @@ class JsonLines:
 class Journal:
     """What a run writes down.
 
-    `metrics.jsonl` has a line for each epoch and seed, `regions.jsonl` for each evaluation and seed, and
-    `provenance.jsonl` for each time that the run began or went on.
+    `metrics.jsonl` has a line for each epoch and seed, `regions.jsonl` for each evaluation and seed,
+    `provenance.jsonl` for each time that the run began or went on, and `faults.jsonl` for each time that numbers of a
+    seed were not finite.
     """
 
     metrics: JsonLines
     regions: JsonLines
     provenance: JsonLines
+    faults: JsonLines
 
     @classmethod
     def of(cls, run_dir: Path) -> Journal:
         """That of a run directory."""
-        return cls(*(JsonLines(run_dir / f"{name}.jsonl") for name in ("metrics", "regions", "provenance")))
+        return cls(*(JsonLines(run_dir / f"{name}.jsonl") for name in ("metrics", "regions", "provenance", "faults")))
 
 
 def of_epoch(metrics: dict[str, jax.Array], seeds: list[int]) -> list[dict[str, Any]]:

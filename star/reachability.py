@@ -25,14 +25,23 @@ from jaxtyping import Array, Bool, Float, Int
 
 UNKNOWN, REACHES, MISSES, MIXED = 0, 1, 2, 3
 
-_ROUNDING = 2.0**-23
+ROUNDING = 2.0**-23  # twice the largest relative error of a float32 operation
 
 
 class Network(struct.PyTreeNode):
-    """x -> f(x), or x + f(x) if `residual`; f is made of `layers` (weight [out, in], bias [out]) with ReLU between."""
+    """x -> f(x), or x + f(x) if `residual`; f is made of `layers` (weight [out, in], bias [out]) with ReLU between.
+
+    Where the biases were computed themselves, `doubt` has for each layer a bound on their errors [out].
+    """
 
     layers: Sequence[tuple[Float[Array, "out in"], Float[Array, "out"]]]
     residual: bool = struct.field(pytree_node=False, default=False)
+    doubt: Sequence[Float[Array, "out"]] = ()
+
+    def affine(self, i: int, z: Zonotope) -> Zonotope:
+        """Image under layer `i`."""
+        image = affine(z, *self.layers[i])
+        return image.replace(slack=image.slack + self.doubt[i]) if self.doubt else image
 
 
 class Zonotope(struct.PyTreeNode):
@@ -64,7 +73,7 @@ class Leaves(struct.PyTreeNode):
 def from_box(lower: Float[Array, "n"], upper: Float[Array, "n"]) -> Zonotope:
     """The box [lower, upper] as a zonotope with one generator per dimension."""
     centre = (lower + upper) / 2
-    slack = _ROUNDING * (jnp.abs(lower) + jnp.abs(upper))
+    slack = ROUNDING * (jnp.abs(lower) + jnp.abs(upper))
     return Zonotope(centre=centre, generators=jnp.diag((upper - lower) / 2), slack=slack)
 
 
@@ -75,7 +84,7 @@ def affine(z: Zonotope, weight: Float[Array, "out n"], bias: Float[Array, "out"]
     return Zonotope(
         centre=dot(weight, z.centre) + bias,
         generators=dot(z.generators, weight.T),
-        slack=dot(jnp.abs(weight), z.slack) + (weight.shape[1] + z.generators.shape[0] + 4) * _ROUNDING * magnitude,
+        slack=dot(jnp.abs(weight), z.slack) + (weight.shape[1] + z.generators.shape[0] + 4) * ROUNDING * magnitude,
     )
 
 
@@ -85,7 +94,7 @@ def _add_input(z: Zonotope, box: Zonotope) -> Zonotope:
     return Zonotope(
         centre=box.centre + z.centre,
         generators=z.generators.at[:n].add(box.generators),
-        slack=box.slack + z.slack + 4 * _ROUNDING * (jnp.abs(box.centre) + box.radius + jnp.abs(z.centre) + z.radius),
+        slack=box.slack + z.slack + 4 * ROUNDING * (jnp.abs(box.centre) + box.radius + jnp.abs(z.centre) + z.radius),
     )
 
 
@@ -98,16 +107,16 @@ def relu(z: Zonotope) -> Zonotope:
     return Zonotope(
         centre=slope * z.centre + offset,
         generators=jnp.concatenate([z.generators * slope, jnp.diag(offset)]),
-        slack=slope * z.slack + 4 * _ROUNDING * (jnp.abs(z.centre) + z.radius),
+        slack=slope * z.slack + 4 * ROUNDING * (jnp.abs(z.centre) + z.radius),
     )
 
 
 def hull(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) -> tuple[Array, Array]:
     """Box that contains the image of the box [lower, upper] under `network`."""
     box = from_box(lower, upper)
-    z = affine(box, *network.layers[0])
-    for weight, bias in network.layers[1:]:
-        z = affine(relu(z), weight, bias)
+    z = network.affine(0, box)
+    for i in range(1, len(network.layers)):
+        z = network.affine(i, relu(z))
     if network.residual:
         z = _add_input(z, box)
     return z.centre - z.radius, z.centre + z.radius
@@ -116,16 +125,16 @@ def hull(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) -
 def smear(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) -> Float[Array, "n"]:
     """Per input: the sum over outputs of the largest |derivative| in the box, times the box's half-width there."""
     layers = network.layers
-    z = affine(from_box(lower, upper), *layers[0])
+    z = network.affine(0, from_box(lower, upper))
     low, high = layers[0][0], layers[0][0]
-    for weight, bias in layers[1:]:
+    for i, (weight, _) in enumerate(layers[1:], 1):
         off = (z.centre + z.radius <= 0)[:, None]
         surely_on = (z.centre - z.radius >= 0)[:, None]
         low = jnp.where(surely_on, low, jnp.where(off, 0.0, jnp.minimum(low, 0.0)))
         high = jnp.where(surely_on, high, jnp.where(off, 0.0, jnp.maximum(high, 0.0)))
         positive, negative = jnp.maximum(weight, 0.0), jnp.minimum(weight, 0.0)
         low, high = positive @ low + negative @ high, positive @ high + negative @ low
-        z = affine(relu(z), weight, bias)
+        z = network.affine(i, relu(z))
     if network.residual:
         low, high = low + jnp.eye(low.shape[0]), high + jnp.eye(low.shape[0])
     return jnp.maximum(jnp.abs(low), jnp.abs(high)).sum(axis=0) * (upper - lower) / 2
@@ -141,8 +150,7 @@ def shares(
     width, target_width = upper - lower, target[1] - target[0]
     overlap = jnp.maximum(jnp.minimum(upper, target[1]) - jnp.maximum(lower, target[0]), 0.0)
     flat = width <= 1e-6 * target_width
-    middle = (lower + upper) / 2
-    inside = ((target[0] <= middle) & (middle <= target[1])).astype(width.dtype)
+    inside = ((target[0] <= lower) & (upper <= target[1])).astype(width.dtype)
     c1 = jnp.prod(jnp.where(flat, inside, overlap / jnp.where(flat, 1.0, width)))
     c2 = jnp.prod(jnp.where(flat, inside, overlap / target_width))
     return c1, c2

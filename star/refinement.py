@@ -50,12 +50,12 @@ class Graph(struct.PyTreeNode):
     """By teachers: 1 where they go from one into the other, -1 where they only go by way of a third, else 0."""
 
     @property
-    def reaches(self) -> Bool[Array, "R R"]:
+    def reaches(self) -> Bool[Array, "*seeds R R"]:
         """Edges: pairs shown reachable."""
         return self.verdict == REACHES
 
     @property
-    def misses(self) -> Bool[Array, "R R"]:
+    def misses(self) -> Bool[Array, "*seeds R R"]:
         """Pairs shown unreachable, and not yet forgotten."""
         return self.verdict == MISSES
 
@@ -69,7 +69,7 @@ class Goals(struct.PyTreeNode):
     weight: Float[Array, "N"]
 
     @classmethod
-    def of(cls, outcome: Outcome, at_goal: Bool[Array, "N"], *, radius: float) -> Goals:
+    def of(cls, outcome: Outcome, at_goal: Bool[Array, "*N"], *, radius: float) -> Goals:
         """The outcomes commanded `at_goal`; goals count as reached within the square inside the circle of success."""
         away = jnp.maximum(outcome.lower - outcome.end, outcome.end - outcome.upper)
         half = (outcome.upper - outcome.lower) / 2
@@ -208,7 +208,7 @@ class Split(struct.PyTreeNode):
     child: Int[Array, ""]
 
     @property
-    def parent(self) -> Int[Array, ""]:
+    def parent(self) -> Int[Array, "*splits"]:
         """The region that was cut."""
         return self.cut.region
 

@@ -19,7 +19,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from math import isfinite
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self, get_args
 
@@ -31,8 +30,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from envs import EnvError, files
+from star import faults, sweep_report, trainer
 from star import program as programs
-from star import sweep_report, trainer
 from star.config import Config, ConfigError, Positive
 from star.loading import check_setting, explain, kind, load, parse, read_file
 from star.metrics import mean
@@ -398,11 +397,11 @@ class _Worker:
         return True
 
     def _is_over(self, one: _Run, rows: Sequence[Mapping[str, Any]], epochs: int, *, evaluated: bool) -> bool:
-        broken = next((key for row in rows for key, x in row.items() if key.endswith("loss") and not isfinite(x)), None)
+        broken = next((told for row in rows for told in faults.broken(row).values()), None)
         measured = {name: values[-1] for name, values in one.evaluations.items() if values}
         measured |= {"env_steps": rows[0]["env_steps"]}
         if broken is not None:
-            reason = f"{broken} is not finite at {rows[0]['env_steps']:,} env steps"
+            reason = f"{broken} at {rows[0]['env_steps']:,} env steps"
             self._end(one.trial, None, reason=reason, measured=measured)
         elif one.epochs >= epochs:
             self._end(one.trial, self._value(one), measured=measured)

@@ -44,7 +44,7 @@ def _actor(config: TD3Config, action_size: int) -> MLP:
     return MLP(config.hidden, action_size, final_scale=0.01)
 
 
-def _q(config: TD3Config, params: Any, obs: Array, action: Array) -> Float[Array, "2 * batch"]:
+def _q(config: TD3Config, params: Any, obs: Array, action: Array) -> Float[Array, "2 *batch"]:
     """Both critics; their parameters are stacked on a leading axis."""
     x = jnp.concatenate([obs, action], axis=-1)
     return jax.vmap(lambda one: apply(MLP(config.hidden, 1), one, x)[..., 0])(params)

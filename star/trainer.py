@@ -6,19 +6,21 @@ import contextlib
 import signal
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import jax
+import numpy as np
 from rich.console import Console
 
-from star import checkpoint, evaluation, profiling, provenance, report, sinks
+from star import checkpoint, evaluation, faults, profiling, provenance, report, sinks
 from star import program as programs
 from star.checkpoint import Checkpoints
 from star.config import Config, ConfigError
 from star.display import Display, Stopwatch
+from star.faults import Fault
 from star.metrics import Journal, by_step, mean, of_epoch
 from star.profiling import Profile
 from star.program import Program
@@ -28,12 +30,14 @@ from star.state import TrainState
 
 @dataclass(frozen=True)
 class Result:
-    """How a call of `train` ended."""
+    """How a call of `train` ended. `fault` is what was not finite, if that is why; `saved` the last checkpoint."""
 
     run_dir: Path
     env_steps: int
     interrupted: bool
     success_final: float | None
+    fault: Fault | None = None
+    saved: int | None = None
 
 
 def train(
@@ -47,6 +51,7 @@ def train(
 ) -> Result:
     """Train to the end, or go on with the run in `run_dir`. Ctrl-C writes a checkpoint and returns.
 
+    Where numbers are no longer finite, it returns too, or goes back and on, as `trainer.on_non_finite` says.
     `profile` is the number of epochs that JAX's profiler traces, to `run_dir/profile`.
     """
     console = console or Console(stderr=True)
@@ -63,9 +68,22 @@ def train(
         state = jax.device_put(program.init(program.seed_keys()), jax.devices()[0])  # as a restored one is
     began = int(state.epoch[0]) * program.env_steps_per_epoch
     journal.provenance.write({"env_steps": began} | provenance.here())
+    if config.trainer.on_non_finite == "rollback" and not checkpoints.steps():
+        checkpoints.save(0, state, program.config, success=0.0)  # there is always one to go back to
     try:
         records = _Records(program, journal)
-        return _loop(records, state, run_dir, checkpoints, quiet=quiet, console=console, profile=(traced, profile))
+        while True:
+            slowed, state = _slowed(program, state, journal)
+            result = _loop(
+                slowed, records, state, run_dir, checkpoints, quiet=quiet, console=console, profile=(traced, profile)
+            )
+            if result.fault is None or not _goes_back(program, checkpoints, journal, result.fault, console):
+                return result
+            state = _restore(program, checkpoints, journal)
+            records.keep_until(checkpoints.steps()[-1])
+            if result.interrupted:
+                return replace(result, env_steps=checkpoints.steps()[-1], fault=None)
+            profile = 0
     finally:
         checkpoints.close()
 
@@ -93,6 +111,11 @@ class _Records:
             self._journal.metrics.write(row)
         self.rows.extend(table)
 
+    def keep_until(self, env_steps: int) -> None:
+        """Forget what came after `env_steps`; the journal has been cut already."""
+        self.rows = [row for row in self.rows if row["env_steps"] <= env_steps]
+        self.regions = [row for row in self.regions if row["env_steps"] <= env_steps]
+
     def add_regions(self, state: TrainState, *, env_steps: int, write: bool = True) -> None:
         """The regions of each seed, if it has a Commander."""
         program = self.program
@@ -108,6 +131,7 @@ class _Records:
 
 
 def _loop(
+    program: Program,
     records: _Records,
     state: TrainState,
     run_dir: Path,
@@ -117,9 +141,8 @@ def _loop(
     console: Console,
     profile: tuple[int, int],
 ) -> Result:
-    program = records.program
     config, seeds = program.config.trainer, program.seeds
-    done = int(state.epoch[0])
+    done, fault = int(state.epoch[0]), None
     saved = done if checkpoints.steps() else -1
     stopwatch = Stopwatch()
     display = Display(
@@ -137,7 +160,7 @@ def _loop(
     trace = Profile(run_dir / "profile", first=profile[0], epochs=profile[1], say=display.say, warn=display.warn)
     with Sinks(run_dir, program.config, records.rows, warn=display.warn) as others:
         with display, trace, interruptible(display.stop) as interrupted:
-            while done < program.epochs and not interrupted():
+            while done < program.epochs and fault is None and not interrupted():
                 trace.before(done)
                 with stopwatch.measure("epoch"):
                     state, metrics = program.epoch(state)
@@ -146,26 +169,69 @@ def _loop(
                 done += 1
                 trace.after(done)
                 env_steps = done * program.env_steps_per_epoch
-                if done % config.eval_every == 0 or done == program.epochs:
+                fault = faults.find(table, state, env_steps=env_steps)
+                if fault is None and (done % config.eval_every == 0 or done == program.epochs):
                     with stopwatch.measure("evaluation"):
                         evaluation.add_to(table, program.evaluate(state, program.evaluation_keys(done)))
                     records.add_regions(state, env_steps=env_steps)
                 records.add(table, env_steps=env_steps, speed=speed)
                 others.write(table)
                 display.update(env_steps, table, left_s=stopwatch.left(_left(program, done)))
-                if done % config.checkpoint_every == 0 or done == program.epochs:
+                if fault is None and (done % config.checkpoint_every == 0 or done == program.epochs):
                     with stopwatch.measure("checkpoint"):
                         save()
                     saved = done
-            stopped = done < program.epochs
-            if saved != done:
+            stopped = interrupted() if fault else done < program.epochs
+            if fault is None and saved != done:
                 save()
         env_steps = done * program.env_steps_per_epoch
-        if not (records.regions and records.regions[-1]["env_steps"] == env_steps):  # stopped between evaluations
+        known = records.regions and records.regions[-1]["env_steps"] == env_steps
+        if fault is None and not known:  # stopped between evaluations
             records.add_regions(state, env_steps=env_steps, write=False)
         _draw(run_dir / "figures", records)
         others.figures(run_dir / "figures")
-    return Result(run_dir, env_steps, stopped, records.success)
+    steps = checkpoints.steps()
+    return Result(run_dir, env_steps, stopped, records.success, fault, saved=steps[-1] if steps else None)
+
+
+def _goes_back(program: Program, checkpoints: Checkpoints, journal: Journal, fault: Fault, console: Console) -> bool:
+    """Whether the run goes back to its last checkpoint for a `fault`, which is said; written down it is anyway."""
+    config, rolled = program.config.trainer, _rollbacks(journal)
+    number = {seed: 1 + sum(row["seed"] == seed for row in rolled) for seed in fault.found}
+    back = config.on_non_finite == "rollback" and all(n <= config.rollbacks for n in number.values())
+    to = checkpoints.steps()[-1] if back else None
+    for seed, found in fault.found.items():
+        journal.faults.write({"env_steps": fault.env_steps, "seed": seed, "back_to": to, "found": found})
+    if back:
+        whose = ", ".join(
+            f"{config.rollback_factor**n:g} for seed {seed} ({n} of {config.rollbacks})" for seed, n in number.items()
+        )
+        line = f"warning: {fault}; back to {to:,} env steps, learning rates times {whose}"
+        console.print(line, style="yellow", highlight=False, markup=False, soft_wrap=True)
+    return back
+
+
+def _slowed(program: Program, state: TrainState, journal: Journal) -> tuple[Program, TrainState]:
+    """`program` and the restored `state` with the learning rates of seeds that were rolled back, each as often.
+
+    Seeds have numbers of their own then, so that the others go on as if nothing had happened.
+    """
+    rolled, config = _rollbacks(journal), program.config.trainer
+    if not rolled and config.on_non_finite == "stop":
+        return program, state
+    env_steps = int(state.epoch[0]) * program.env_steps_per_epoch
+
+    def factors(rows: list[dict[str, Any]]) -> list[float]:
+        return [config.rollback_factor ** sum(row["seed"] == seed for row in rows) for seed in program.seeds]
+
+    agent = jax.tree.map(lambda x: np.full(len(program.seeds), x, np.float32), program.config.agent())
+    # A step size that is part of the state was made smaller by the rollbacks before its checkpoint.
+    since = [row for row in rolled if row["back_to"] >= env_steps]
+    return replace(program, agent=faults.slower(agent, factors(rolled))), faults.slower(state, factors(since))
+
+
+def _rollbacks(journal: Journal) -> list[dict[str, Any]]:
+    return [row for row in journal.faults.read() if row["back_to"] is not None]
 
 
 def _draw(folder: Path, records: _Records) -> None:

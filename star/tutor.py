@@ -43,7 +43,7 @@ class Trace(struct.PyTreeNode):
 
 def observe(
     config: TutorConfig, state: Float[Array, "*batch state"], abstract: Float[Array, "*batch d"], box: Box
-) -> Float[Array, "*batch state+2d"]:
+) -> Float[Array, "*batch state+2*d"]:
     """The state with the bounds of the target box, relative to `abstract`, its abstract part, or as they are."""
     origin = abstract if config.relative_bounds else jnp.zeros_like(abstract)
     return jnp.concatenate([state, box.lower - origin, box.upper - origin], axis=-1)
@@ -54,7 +54,7 @@ def subgoal(action: Float[Array, "*batch p"], scale: Float[Array, "p"]) -> Float
     return jnp.clip(action, -1.0, 1.0) * scale
 
 
-def reward(config: TutorConfig, distances: Float[Array, "l + 1 * batch"], alive: Float[Array, "l * batch"]) -> Array:
+def reward(config: TutorConfig, distances: Float[Array, "states *batch"], alive: Float[Array, "l *batch"]) -> Array:
     """Reward of one decision from the distances to the box's centre before and after each of its env steps.
 
     `alive` [l, ...] is 0 for steps after the environment had ended; they count for nothing.

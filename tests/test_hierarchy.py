@@ -185,7 +185,7 @@ def test_an_epoch_changes_every_level_and_nothing_about_shapes_types_or_structur
 
 def test_metrics_are_finite_scalars_prefixed_by_level(first):
     _, _, metrics = first
-    levels = {"commander", "tutor", "controller", "forward_model", "refinement", "abstraction", "train", "env"}
+    levels = {"commander", "tutor", "controller", "forward_model", "refinement", "abstraction", "train", "env", "graph"}
     assert {name.split("/")[0] for name in metrics} == levels
     for name, value in metrics.items():
         assert value.shape == () and np.isfinite(value), name
@@ -198,6 +198,7 @@ def test_early_ends_are_counted_by_their_reason(first):
         count = float(metrics[name])
         assert count == round(count) and 0 < count <= B * 30 // L
     assert float(metrics["env/overflow"]) == 0
+    assert not any(metrics[name] for name in metrics if name.endswith("non_finite") and name != "env/non_finite")
 
 
 def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(first):

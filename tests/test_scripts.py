@@ -7,10 +7,12 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import star.state
 from envs.arena import Arena
-from star import loading
+from star import loading, reachability, replay
 from star import program as programs
 from star.commander import Decision
 from star.evaluation import bootstrap
@@ -236,3 +238,41 @@ def test_the_fair_table_takes_one_setting_of_each_selector_for_all_beds():
     lines = script.table(found).splitlines()
     assert "| first | 2 | 0.610 [0.600, 0.620] | 0.710 | 0.510 |" in lines
     assert any(line.startswith("| first | 1 | 0.910") for line in lines)  # the best of bed a alone
+
+
+@settings(max_examples=5)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_random_triple_of_the_check_of_soundness_lies_outside_of_its_hull(seed):
+    script = load("verify_soundness")
+    script.NETWORKS, script.MODELS = script.NETWORKS[:1], script.MODELS[:1]
+    row = script.check_triples(10_000, seed=seed, chunk=5000)
+    assert row["triples"] >= 10_000 and row["outside"] == 0 and row["nearest_ulp"] > 0
+
+
+def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_small(tiny, breaking_env, monkeypatch):
+    """The forward model moves everything one region to the right, and by some noise."""
+    script, spec = load("verify_soundness"), Spec.of(breaking_env.env)
+    agent = loading.parse(
+        tiny, {"abstraction.cuts": [[8.0], [8.0]], "refinement.parts": 8, "refinement.depth": 3}
+    ).agent()
+    state = star.state.init(agent, spec, key=jax.random.key(0))
+    layer = state.forward_model.params["params"]["Dense_1"]
+    moving = {"kernel": 0.1 * layer["kernel"], "bias": jax.numpy.array([1.0, 0.0])}
+    params = {"params": {**state.forward_model.params["params"], "Dense_1": moving}}
+    starts = jax.random.uniform(jax.random.key(1), (64, 2), minval=-4.0, maxval=20.0)
+    ring = replay.add(state.forward_model.ring, Outcome(starts, starts, starts, starts, weight=jax.numpy.ones(64)))
+    state = state.replace(forward_model=state.forward_model.replace(params=params, ring=ring))
+    row = script.check_verdicts(agent, state, points=50)
+    assert row["pairs"] == 12
+    for name, lost in (("strict", "do_not_arrive"), ("trained", "outside_hull")):
+        assert row[name]["parts"] >= 2 and row[name]["points"] == row[name]["parts"] * 54
+        assert row[name][lost] == row[name]["outside_hull"] == 0
+    hull = reachability.hull
+
+    def middle(*box):
+        low, high = hull(*box)
+        return 0.6 * low + 0.4 * high, 0.4 * low + 0.6 * high
+
+    monkeypatch.setattr(reachability, "hull", middle)
+    row = script.check_verdicts(agent, state, points=50)
+    assert row["strict"]["do_not_arrive"] > 0 and row["trained"]["outside_hull"] > 0
