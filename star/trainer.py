@@ -60,7 +60,7 @@ def train(
         state = _restore(program, checkpoints, journal)
     else:
         _prepare(run_dir, program.config)
-        state = jax.device_put(program.init(program.seed_keys()), jax.devices()[0])  # as a restored one is
+        state = program.init(program.seed_keys())
     began = int(state.epoch[0]) * program.env_steps_per_epoch
     journal.provenance.write({"env_steps": began} | provenance.here())
     try:
