@@ -111,6 +111,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="EPOCHS",
         help="trace so many epochs after compilation (default: 1) with JAX's profiler, to RUN/profile",
     )
+    train.add_argument(
+        "--distributed",
+        metavar="auto|HOST:PORT,I,N",
+        help="be one of several processes: as SLURM or Open MPI started them, or process I of N that meet at HOST:PORT",
+    )
     train.add_argument("--quiet", action="store_true", help="no progress")
     train.set_defaults(function=_train)
 
@@ -275,11 +280,17 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         name = "-".join(file.stem for file in (options.config, *options.layers))
         run_dir = options.run_dir or Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
 
-    from star import trainer
+    from star import devices, trainer
 
+    if options.distributed is not None:
+        if options.resume is None and options.run_dir is None:
+            raise ConfigError("--distributed: needs --run-dir, the same for all processes")
+        devices.join(options.distributed)
     result = trainer.train(
         config, run_dir, resume=options.resume is not None, quiet=options.quiet, profile=options.profile
     )
+    if not devices.first():
+        return 130 if result.interrupted else 0
     if result.interrupted:
         print(f"interrupted at {result.env_steps:,} env steps; go on with: star train --resume {run_dir}")
         return 130
@@ -316,7 +327,7 @@ def _evaluate(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     chosen, groups = _chosen(options)
     if not chosen:
         raise ConfigError("star evaluate: give a RUN, or --group NAME=RUN,RUN (see star evaluate --help)")
-    configs = {run: _run_config(run, {"env.engine": "auto"} | others) for run, _ in chosen}
+    configs = {run: _agent_config(run, others) for run, _ in chosen}
     out = options.out or (chosen[0][0] / "evaluation" if options.goals == "grid" else None)
 
     from star import assessment
@@ -424,7 +435,7 @@ def _render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         if options.episode is None and (options.goals == "grid" or "trainer.eval_episodes" in overrides):
             raise ConfigError("--goals and --episodes: need --episode K, they say of which evaluation")
         task, others = _split_task(overrides)
-        config = _run_config(options.run, {"env.engine": "auto"} | others)
+        config = _agent_config(options.run, others)
         if options.task not in (None, config.env.name):
             raise ConfigError(f"{options.run}: its agent was trained on {config.env.name}, not on {options.task}")
     _check_output(options)
@@ -467,7 +478,7 @@ def _check_output(options: argparse.Namespace) -> None:
 
 
 def _record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
-    config = _run_config(options.run, {"env.engine": "auto"} | overrides)
+    config = _agent_config(options.run, overrides)
 
     from star import record
 
@@ -529,6 +540,11 @@ def _settings(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 def _refuse(overrides: dict[str, Any]) -> None:
     for key in overrides:
         raise ConfigError(f"--{key}: this command takes no settings")
+
+
+def _agent_config(run_dir: Path, overrides: dict[str, Any]) -> Config:
+    """That of a run, to act on this machine, whatever it was trained on."""
+    return _run_config(run_dir, {"env.engine": "auto", "trainer.devices": 1} | overrides)
 
 
 def _run_config(run_dir: Path, overrides: dict[str, Any]) -> Config:

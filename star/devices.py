@@ -35,7 +35,7 @@ def mesh(count: int) -> Mesh | None:
     if count > len(there):
         raise ConfigError(
             f"trainer.devices: {count} are not available, JAX sees {len(there)} ({jax.default_backend()}); "
-            f"allowed: 1 to {len(there)}"
+            f"allowed: {'1 to ' * (len(there) > 1)}{len(there)}"
         )
     if processes > 1 and count != len(there):
         raise ConfigError(
@@ -94,17 +94,17 @@ def as_on_first(tree: Any) -> Any:
     )(tree)
 
 
-def join(cluster: str | None) -> None:
-    """Become one of several processes before JAX looks for devices.
+def join(cluster: str) -> None:
+    """Become one of several processes, before JAX looks for devices; raises `ConfigError`.
 
-    `cluster` is ADDRESS,NUMBER,COUNT: host:port of the first process, the number of this one, and how many there are.
-    With None they are those of SLURM, Open MPI and what else `jax.distributed` knows. Raises `ConfigError`.
+    `cluster` is HOST:PORT,NUMBER,COUNT: where the first process listens, the number of this one from 0, and how many
+    there are; or "auto" for what SLURM, Open MPI and the like say of themselves.
     """
     known: dict[str, Any] = {}
-    if cluster is not None:
+    if cluster != "auto":
         address, *numbers = cluster.split(",")
         if ":" not in address or len(numbers) != 2 or not all(number.isdecimal() for number in numbers):
-            raise ConfigError(f"--distributed: {cluster!r} is not of the form HOST:PORT,NUMBER,COUNT")
+            raise ConfigError(f"--distributed: {cluster!r} is neither auto nor of the form HOST:PORT,NUMBER,COUNT")
         number, count = map(int, numbers)
         if number >= count:
             raise ConfigError(f"--distributed: process {number} is not among those of {count}: 0 to {count - 1}")
@@ -112,7 +112,12 @@ def join(cluster: str | None) -> None:
     try:
         jax.distributed.initialize(**known)
     except (RuntimeError, ValueError) as error:
-        raise ConfigError(f"--distributed: {' '.join(str(error).split())[:200]}") from None
+        reason = " ".join(str(error).split())[:160]
+        if cluster == "auto":
+            raise ConfigError(
+                f"--distributed: auto knows no cluster here ({reason}); start with srun or mpirun, or give HOST:PORT,I,N"
+            ) from None
+        raise ConfigError(f"--distributed: {cluster}: {reason}") from None
 
 
 def first() -> bool:

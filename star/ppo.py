@@ -180,9 +180,18 @@ def _prepare(config: PPOConfig, state: PPOState, rollout: Transition, *, keep: b
 
 
 def _minibatches(samples: _Sample, count: int, *, key: Array) -> _Sample:
-    order = jax.random.permutation(key, samples.weight.shape[0]).reshape(count, -1)
-    order = devices.share(order, axis=1)
-    return devices.share(jax.tree.map(lambda x: x[order], samples), axis=1)
+    """`count` minibatches [count, N], shuffled, whose weights sum to 1 and whose advantages have mean 0 and variance 1.
+
+    Each device gets its share of each; what takes sums over a minibatch is done before, where that costs no messages.
+    """
+    order = devices.whole(jax.random.permutation(key, samples.weight.shape[0])).reshape(count, -1)
+    weight, advantage = devices.whole((samples.weight[order], samples.advantage[order]))
+    weight /= jnp.maximum(weight.sum(axis=1, keepdims=True), 1.0)
+    centred = advantage - jnp.sum(weight * advantage, axis=1, keepdims=True)
+    advantage = centred / (jnp.sqrt(jnp.sum(weight * jnp.square(centred), axis=1, keepdims=True)) + 1e-8)
+    ours = devices.share(order, axis=1)
+    batches = jax.tree.map(lambda x: x[ours], samples).replace(weight=weight, advantage=advantage)
+    return devices.share(batches, axis=1)
 
 
 def _gradient_step(
@@ -207,10 +216,7 @@ def _loss(
     params: Mapping[str, Any],
     batch: _Sample,
 ) -> tuple[Array, Metrics]:
-    share = batch.weight / jnp.maximum(batch.weight.sum(), 1.0)
-    centred = batch.advantage - jnp.sum(share * batch.advantage)
-    advantage = centred / (jnp.sqrt(jnp.sum(share * jnp.square(centred))) + 1e-8)
-
+    share, advantage = batch.weight, batch.advantage
     mean, std = _policy(config, params, batch.obs)
     log_ratio = _log_prob(mean, std, batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)

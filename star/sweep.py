@@ -205,6 +205,8 @@ def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: An
     base = load(
         folder / sweep.config, sweep.settings | dict(settings or {}), layers=[folder / layer for layer in sweep.layers]
     )
+    if base.trainer.devices > 1 or "trainer.devices" in sweep.parameters:
+        raise ConfigError(f"{path}: trainer.devices: a sweep trains on 1; start a worker for each device, with --out")
     for key, parameter in sweep.parameters.items():
         for value in parameter.ends:
             check_setting(base, key, value, source=f"{path}: parameters")

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 from rich.console import Console
 
-from star import checkpoint, evaluation, profiling, provenance, report, sinks
+from star import checkpoint, devices, evaluation, profiling, provenance, report, sinks
 from star import program as programs
 from star.checkpoint import Checkpoints
 from star.config import Config, ConfigError
@@ -47,22 +47,24 @@ def train(
 ) -> Result:
     """Train to the end, or go on with the run in `run_dir`. Ctrl-C writes a checkpoint and returns.
 
-    `profile` is the number of epochs that JAX's profiler traces, to `run_dir/profile`.
+    `profile` is the number of epochs that JAX's profiler traces, to `run_dir/profile`. Several processes (`devices.join`)
+    call this alike, and only the first of them writes anything but its share of the checkpoints.
     """
-    console = console or Console(stderr=True)
     sinks.check(config)
     program = programs.build(config)
     program.lessons()  # refused before anything is written
+    console = console or Console(stderr=True, quiet=not devices.first())
     checkpoints = Checkpoints(run_dir, keep=config.trainer.keep_checkpoints)
+    profile *= devices.first()
     traced = _traced(program, checkpoints, profile) if profile else 0
-    journal = Journal.of(run_dir)
+    journal = Journal.of(run_dir, muted=not devices.first())
     if resume:
         state = _restore(program, checkpoints, journal)
     else:
         _prepare(run_dir, program.config)
         state = program.init(program.seed_keys())
-    began = int(state.epoch[0]) * program.env_steps_per_epoch
-    journal.provenance.write({"env_steps": began} | provenance.here())
+    began = _epochs(state) * program.env_steps_per_epoch
+    journal.provenance.write({"env_steps": began} | provenance.here(devices=config.trainer.devices))
     try:
         records = _Records(program, journal)
         return _loop(records, state, run_dir, checkpoints, quiet=quiet, console=console, profile=(traced, profile))
@@ -119,13 +121,13 @@ def _loop(
 ) -> Result:
     program = records.program
     config, seeds = program.config.trainer, program.seeds
-    done = int(state.epoch[0])
+    done = _epochs(state)
     saved = done if checkpoints.steps() else -1
     stopwatch = Stopwatch()
     display = Display(
         console,
         stopwatch,
-        title=f"{program.config.env.name} on {jax.default_backend()}, {_named(seeds)}",
+        title=f"{program.config.env.name} on {_machine(config.devices)}, {_named(seeds)}",
         total_env_steps=program.epochs * program.env_steps_per_epoch,
         done_env_steps=done * program.env_steps_per_epoch,
         quiet=quiet,
@@ -135,9 +137,9 @@ def _loop(
         checkpoints.save(done * program.env_steps_per_epoch, state, program.config, success=records.success or 0.0)
 
     trace = Profile(run_dir / "profile", first=profile[0], epochs=profile[1], say=display.say, warn=display.warn)
-    with Sinks(run_dir, program.config, records.rows, warn=display.warn) as others:
+    with Sinks(run_dir, program.config, records.rows, warn=display.warn, muted=not devices.first()) as others:
         with display, trace, interruptible(display.stop) as interrupted:
-            while done < program.epochs and not interrupted():
+            while done < program.epochs and not devices.anywhere(interrupted()):
                 trace.before(done)
                 with stopwatch.measure("epoch"):
                     state, metrics = program.epoch(state)
@@ -163,7 +165,8 @@ def _loop(
         env_steps = done * program.env_steps_per_epoch
         if not (records.regions and records.regions[-1]["env_steps"] == env_steps):  # stopped between evaluations
             records.add_regions(state, env_steps=env_steps, write=False)
-        _draw(run_dir / "figures", records)
+        if devices.first():
+            _draw(run_dir / "figures", records)
         others.figures(run_dir / "figures")
     return Result(run_dir, env_steps, stopped, records.success)
 
@@ -175,6 +178,15 @@ def _draw(folder: Path, records: _Records) -> None:
         report.growth_figure(folder / "growth.png", regions=regions, walls=walls)
     if rows and records.program.config.sgim.enabled:
         report.sgim_figure(folder / "sgim.png", regions=regions, rows=rows, walls=walls)
+
+
+def _epochs(state: TrainState) -> int:
+    """How many are over."""
+    return int(jax.device_get(state.epoch)[0])
+
+
+def _machine(count: int) -> str:
+    return (f"{count} x " if count > 1 else "") + jax.default_backend()
 
 
 def _named(seeds: list[int]) -> str:
@@ -212,6 +224,7 @@ def _restore(program: Program, checkpoints: Checkpoints, journal: Journal) -> Tr
     state = checkpoint.restore(program, checkpoints, steps[-1], source=run_dir)
     for lines in (journal.metrics, journal.regions):
         lines.keep_until(steps[-1])
+    devices.wait("the journal is that of the checkpoint")
     return state
 
 
@@ -220,6 +233,9 @@ def _prepare(run_dir: Path, config: Config) -> None:
         raise ConfigError(
             f"{run_dir}: is not empty; choose another --run-dir, or go on with it: star train --resume {run_dir}"
         )
+    devices.wait("the run directory is empty")
+    if not devices.first():
+        return
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         (run_dir / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
