@@ -47,7 +47,7 @@ def mesh(count: int) -> Mesh | None:
 
 
 def on(mesh: Mesh | None, function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, to be jitted, with `share` and `whole` meaning `mesh`."""
+    """`function`, to be jitted, with `share` and `whole` meaning `mesh`, on which some argument or result must lie."""
     if mesh is None:
         return function
 
@@ -64,9 +64,14 @@ def everywhere(mesh: Mesh | None) -> jax.sharding.Sharding:
     return SingleDeviceSharding(jax.devices()[0]) if mesh is None else NamedSharding(mesh, _WHOLE)
 
 
+def in_shares(mesh: Mesh | None, *, axis: int = 0) -> jax.sharding.Sharding:
+    """Where arrays lie that are cut along `axis`; without a mesh on the first device."""
+    return everywhere(mesh) if mesh is None else NamedSharding(mesh, _cut(axis))
+
+
 def share(tree: Any, *, axis: int = 0) -> Any:
     """`tree`, cut along `axis` of all its leaves, whose size the number of devices divides."""
-    return _constrained(tree, PartitionSpec(*[None] * axis, AXIS))
+    return _constrained(tree, _cut(axis))
 
 
 def whole(tree: Any) -> Any:
@@ -134,6 +139,10 @@ def wait(name: str) -> None:
 def anywhere(flag: bool) -> bool:
     """Whether `flag` is set in any process; all of them must ask."""
     return flag if jax.process_count() == 1 else bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
+
+
+def _cut(axis: int) -> PartitionSpec:
+    return PartitionSpec(*[None] * axis, AXIS)
 
 
 def _on_mesh() -> bool:

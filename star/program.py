@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 
 import envs
 from envs import arena
@@ -221,9 +221,7 @@ def evaluation_keys(seeds: Sequence[int], numbers: Sequence[int] | np.ndarray, *
 def _placement(mesh: Mesh | None, state: TrainState) -> TrainState:
     """Where the leaves of `state` lie between epochs: the rings of the levels in shares, all else whole."""
     places = jax.tree.map(lambda _: devices.everywhere(mesh), state)
-    if mesh is None:
-        return places
-    slots = NamedSharding(mesh, PartitionSpec(None, None, devices.AXIS))  # of [seeds, 1, slots, ...]
+    slots = devices.in_shares(mesh, axis=2)  # of rings [seeds, 1, slots, ...]
 
     def cut(level: Any) -> Any:
         if not isinstance(level, TD3State):
