@@ -92,11 +92,13 @@ def as_on_first(tree: Any) -> Any:
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
             return leaf  # made of integers alone, so that copies cannot differ
         ours = jnp.where(jax.lax.axis_index(AXIS) == 0, leaf, jnp.zeros_like(leaf))
-        return jax.lax.psum(ours.astype(jnp.int8), AXIS).astype(bool) if leaf.dtype == bool else jax.lax.psum(ours, AXIS)
+        return (
+            jax.lax.psum(ours.astype(jnp.int8), AXIS).astype(bool) if leaf.dtype == bool else jax.lax.psum(ours, AXIS)
+        )
 
-    return jax.shard_map(
-        lambda tree: jax.tree.map(copied, tree), in_specs=_WHOLE, out_specs=_WHOLE, check_vma=False
-    )(tree)
+    return jax.shard_map(lambda tree: jax.tree.map(copied, tree), in_specs=_WHOLE, out_specs=_WHOLE, check_vma=False)(
+        tree
+    )
 
 
 def join(cluster: str) -> None:
@@ -120,7 +122,8 @@ def join(cluster: str) -> None:
         reason = " ".join(str(error).split())[:160]
         if cluster == "auto":
             raise ConfigError(
-                f"--distributed: auto knows no cluster here ({reason}); start with srun or mpirun, or give HOST:PORT,I,N"
+                f"--distributed: auto knows no cluster here ({reason}); "
+                "start with srun or mpirun, or give HOST:PORT,I,N"
             ) from None
         raise ConfigError(f"--distributed: {cluster}: {reason}") from None
 

@@ -161,7 +161,7 @@ def _log_prob(mean: Array, std: Array, action: Array) -> Array:
 def _prepare(config: PPOConfig, state: PPOState, rollout: Transition, *, keep: bool) -> _Sample:
     """The rollout as independent samples [T * B], seen through the networks that collected it.
 
-    With `keep` the samples hold their transition too. Every device gets them all, to draw its share of a minibatch from.
+    With `keep` the samples hold their transition too. Every device gets them all, to draw its shares of minibatches.
     """
     obs, next_obs = state.normalizer(rollout.obs), state.normalizer(rollout.next_obs)
     values = _value(config, state.params, obs)

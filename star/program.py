@@ -236,7 +236,9 @@ def _as_on_first(state: TrainState, placement: TrainState) -> TrainState:
     leaves, structure = jax.tree.flatten(state)
     copies = [place.is_fully_replicated for place in jax.tree.leaves(placement)]
     same = iter(devices.as_on_first([leaf for leaf, copy in zip(leaves, copies, strict=True) if copy]))
-    return jax.tree.unflatten(structure, [next(same) if copy else leaf for leaf, copy in zip(leaves, copies, strict=True)])
+    return jax.tree.unflatten(
+        structure, [next(same) if copy else leaf for leaf, copy in zip(leaves, copies, strict=True)]
+    )
 
 
 def _axis(agent: AgentConfig) -> int | None:

@@ -19,7 +19,8 @@ _PACKAGES = ("star-rl", "jax", "mujoco", "mujoco-mjx", "brax")
 def here(*, devices: int = 1) -> dict[str, Any]:
     """`time` (UTC), `commit`, `device`, `python` and the `versions` of packages, of this process.
 
-    `device` is the kind of the first, and how many of them are used if there are several, `devices`. `commit` is that of the checkout which the code lies in, with a + if it was changed; empty where there is none.
+    `device` is the kind of the first one, and how many are used if there are several, `devices`. `commit` is that of
+    the checkout which the code lies in, with a + if it was changed; empty where there is none.
     """
     device = jax.devices()[0]
     cores = len(os.sched_getaffinity(0))

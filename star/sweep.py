@@ -161,7 +161,7 @@ class Plan:
     @property
     def description(self) -> dict[str, Any]:
         """What must be equal for workers to share a study. How many trials, and on what machine, may differ."""
-        values = self.base.model_dump(mode="json", exclude={"env": {"engine"}, "trainer": {"device"}})
+        values = self.base.model_dump(mode="json", exclude={"env": {"engine"}, "trainer": {"device", "devices"}})
         about = self.file.model_dump(
             mode="json", include={"parameters", "sampler", "pruner", "prune_after", "objective", "summary"}
         )

@@ -47,8 +47,8 @@ def train(
 ) -> Result:
     """Train to the end, or go on with the run in `run_dir`. Ctrl-C writes a checkpoint and returns.
 
-    `profile` is the number of epochs that JAX's profiler traces, to `run_dir/profile`. Several processes (`devices.join`)
-    call this alike, and only the first of them writes anything but its share of the checkpoints.
+    `profile` is the number of epochs that JAX's profiler traces, to `run_dir/profile`. Several processes
+    (`devices.join`) call this alike, and only the first of them writes anything but its share of the checkpoints.
     """
     sinks.check(config)
     program = programs.build(config)

@@ -1,4 +1,4 @@
-"""Several devices and several processes, in processes of their own: how many devices JAX has is settled at its start."""
+"""Several devices and processes, in processes of their own: how many devices JAX has is settled at its start."""
 
 import os
 import socket
@@ -30,17 +30,16 @@ rollout = Transition(obs=number(5, 8, 3), action=number(5, 8, 2), reward=number(
 state = td3.init(jax.random.key(0), config, example=example)
 
 def learn(mesh):
-    def two(state, rollout):
-        for number in range(2):  # the second one goes beyond the end of the ring
-            state, _ = td3.update(config, state, rollout, key=jax.random.key(number))
-        return state
     places = jax.tree.map(lambda _: devices.everywhere(mesh), state)
     slots = jax.tree.map(lambda _: devices.in_shares(mesh, axis=1), state.ring.experience)
     places = places.replace(ring=places.ring.replace(experience=slots))
-    compiled = jax.jit(devices.on(mesh, two), out_shardings=places).lower(
-        jax.device_put(state, places), jax.device_put(rollout, devices.in_shares(mesh, axis=1))
-    ).compile()
-    return compiled(jax.device_put(state, places), jax.device_put(rollout, devices.in_shares(mesh, axis=1)))
+    update = lambda state, rollout, key: td3.update(config, state, rollout, key=key)[0]
+    update = jax.jit(devices.on(mesh, update), out_shardings=places)
+    learnt, ours = jax.device_put(state, places), jax.device_put(rollout, devices.in_shares(mesh, axis=1))
+    for number in range(2):  # the second one goes beyond the end of the ring
+        learnt = update(learnt, ours, jax.random.key(number))
+    assert update._cache_size() == 1
+    return learnt
 
 one, four = learn(None), learn(devices.mesh(4))
 assert four.ring.experience.obs.addressable_shards[0].data.shape == (1, 16, 3)

@@ -275,24 +275,21 @@ def test_a_checkpoint_of_another_shape_or_environment_is_refused(finished, overr
 
 
 def test_four_devices_train_as_one_does_and_any_number_goes_on(finished, tmp_path):
-    """Two epochs on four devices, the other two on one; two devices get the same state, each all of it."""
+    """Two epochs on four devices, the other two on one; its checkpoint goes to two as well."""
     training = """
 import json, sys
 from pathlib import Path
-import jax, numpy as np
+import jax
 from star import checkpoint, trainer
 from star import program as programs
 from star.loading import parse
 
 config, run_dir = json.loads(sys.argv[1]), Path(sys.argv[2])
 trainer.train(parse(config, {"trainer.devices": 4}), run_dir, quiet=True)
-states = []
-for count in (4, 2):
-    program = programs.build(parse(config, {"trainer.devices": count}))
-    states.append(checkpoint.load_state(program, run_dir, "last")[1])
-    assert all(len(leaf.sharding.device_set) == count for leaf in jax.tree.leaves(states[-1]))
-keys, others = zip(*((state.key, state.replace(key=None)) for state in states))
-jax.tree.map(np.testing.assert_array_equal, *map(jax.device_get, others))
+program = programs.build(parse(config, {"trainer.devices": 2}))
+_, state = checkpoint.load_state(program, run_dir, "last")
+assert all(leaf.sharding.device_set == set(jax.devices()[:2]) for leaf in jax.tree.leaves(state))
+assert jax.device_get(state.epoch).tolist() == [2, 2]
 """
     run_dir, half = tmp_path / "run", TINY | {"trainer": TINY["trainer"] | {"total_env_steps": 2 * EPOCH}}
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
