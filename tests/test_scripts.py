@@ -236,3 +236,13 @@ def test_the_fair_table_takes_one_setting_of_each_selector_for_all_beds():
     lines = script.table(found).splitlines()
     assert "| first | 2 | 0.610 [0.600, 0.620] | 0.710 | 0.510 |" in lines
     assert any(line.startswith("| first | 1 | 0.910") for line in lines)  # the best of bed a alone
+
+
+def test_the_benchmark_of_devices_measures_physics_and_compares_with_one_device(run):
+    script = load("benchmark_devices")
+    seconds = script.physics(programs.build(loading.load(run / "config.yaml")), 2)
+    assert len(seconds) == 2 and min(seconds) > 0
+    one = {"devices": 1, "physics": 100.0, "acting": 50.0, "epoch": 20.0}
+    two = {"devices": 2, "physics": 200.0, "acting": 90.0, "epoch": 34.0}
+    assert script.ratio(two, one) == {"physics": 2.0, "acting": 1.8, "epoch": 1.7}
+    assert script.ratio(two, two) is None
