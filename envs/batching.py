@@ -1,4 +1,4 @@
-"""One flat batch axis, however many vmaps surround a function."""
+"""One flat batch axis, however many vmaps surround a function, and its share for each device of a mesh."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+from jax.sharding import PartitionSpec
+
+AXIS = "envs"
+"""The axis of a mesh of devices over which environments are shared out."""
 
 
 def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -28,3 +32,20 @@ def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
         return out, jax.tree.map(lambda _: True, out)
 
     return inner
+
+
+def shared_out(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` of pytrees with a leading batch axis [n, ...], called by each device for its share of the batch.
+
+    Where the mesh of the context has no axis `AXIS` it is `function` itself. Else its size must divide n, and a vmap
+    over S around it makes [S, n / devices, ...] of the share, not of the whole. JAX's partitioner could not do it:
+    neither host callbacks nor kernels of Warp tell it how to cut them.
+    """
+
+    def call(*args: Any) -> Any:
+        if AXIS not in jax.sharding.get_abstract_mesh().axis_names:
+            return function(*args)
+        share = PartitionSpec(AXIS)
+        return jax.shard_map(function, in_specs=share, out_specs=share, check_vma=False)(*args)
+
+    return call

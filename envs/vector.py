@@ -6,7 +6,7 @@
 
 A physics engine wants one flat batch: nested vmaps break MJX-Warp and multiply host callbacks. So `step` and
 `reset_where` are flattened: an outer vmap over S turns [S, B, ...] into [S * B, ...], steps once, and turns the
-result back.
+result back. On a mesh of devices each does so with its share of the B.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from envs._quiet import Env, State
-from envs.batching import flattened
+from envs.batching import flattened, shared_out
 
 
 class VectorEnv:
@@ -33,8 +33,8 @@ class VectorEnv:
         self.env = env
         self.num_envs = num_envs
         self.auto_reset = auto_reset
-        self._step = flattened(self._step_batch)
-        self._reset_where = flattened(self._reset_batch)
+        self._step = shared_out(flattened(self._step_batch))
+        self._reset_where = shared_out(flattened(self._reset_batch))
 
     def reset(self, rng: jax.Array) -> State:
         """New episodes [B] from one key, typed or raw."""

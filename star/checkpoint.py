@@ -83,13 +83,17 @@ class Checkpoints:
         return parse(saved["config"], source=str(path))
 
     def restore(self, step: int, example: TrainState) -> TrainState:
-        """The state saved at `step`, on the first device here, whatever it was saved on.
+        """The state saved at `step`, whatever devices it was saved on.
 
-        `example` (arrays or their shapes) gives the structure it must have.
+        `example` (arrays or their shapes) gives the structure it must have, and the devices: else the first one here.
         """
         here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         shapes = jax.eval_shape(_plain, example)
-        template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), shapes)
+        template = jax.tree.map(
+            lambda x, like: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=getattr(like, "sharding", None) or here),
+            shapes,
+            example,
+        )
         args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
         hook, sys.unraisablehook = sys.unraisablehook, partial(_report, sys.unraisablehook)
         try:
@@ -161,7 +165,7 @@ def choose(checkpoints: Checkpoints, run_dir: Path, wanted: str) -> int:
 def restore(program: Program, checkpoints: Checkpoints, step: int, *, source: Path) -> TrainState:
     """The state of all seeds in the checkpoint at `step`; raises `ConfigError` if it is none of `program`."""
     check_compatible(checkpoints.config(step), program.config, source=source)
-    return checkpoints.restore(step, jax.eval_shape(program.init, program.seed_keys()))
+    return checkpoints.restore(step, program.example())
 
 
 def load_agent(

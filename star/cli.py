@@ -117,6 +117,11 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument(
         "--debug", action="store_true", help="stop at the first NaN with a Python traceback, and check shapes; slow"
     )
+    train.add_argument(
+        "--distributed",
+        metavar="auto|HOST:PORT,I,N",
+        help="be one of several processes: as SLURM or Open MPI started them, or process I of N that meet at HOST:PORT",
+    )
     train.add_argument("--quiet", action="store_true", help="no progress")
     train.set_defaults(function=_train)
 
@@ -288,11 +293,17 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
         debugging.turn_on()
 
-    from star import trainer
+    from star import devices, trainer
 
+    if options.distributed is not None:
+        if options.resume is None and options.run_dir is None:
+            raise ConfigError("--distributed: needs --run-dir, the same for all processes")
+        devices.join(options.distributed)
     result = trainer.train(
         config, run_dir, resume=options.resume is not None, quiet=options.quiet, profile=options.profile
     )
+    if not devices.first():
+        return 3 if result.fault is not None else 130 if result.interrupted else 0
     if result.fault is not None:
         print(f"stopped: {result.fault}; {_after_a_fault(result, config.trainer)}", file=sys.stderr)
         return 3
@@ -345,7 +356,7 @@ def _evaluate(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     chosen, groups = _chosen(options)
     if not chosen:
         raise ConfigError("star evaluate: give a RUN, or --group NAME=RUN,RUN (see star evaluate --help)")
-    configs = {run: _run_config(run, {"env.engine": "auto"} | others) for run, _ in chosen}
+    configs = {run: _agent_config(run, others) for run, _ in chosen}
     out = options.out or (chosen[0][0] / "evaluation" if options.goals == "grid" else None)
 
     from star import assessment
@@ -453,7 +464,7 @@ def _render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         if options.episode is None and (options.goals == "grid" or "trainer.eval_episodes" in overrides):
             raise ConfigError("--goals and --episodes: need --episode K, they say of which evaluation")
         task, others = _split_task(overrides)
-        config = _run_config(options.run, {"env.engine": "auto"} | others)
+        config = _agent_config(options.run, others)
         if options.task not in (None, config.env.name):
             raise ConfigError(f"{options.run}: its agent was trained on {config.env.name}, not on {options.task}")
     _check_output(options)
@@ -496,7 +507,7 @@ def _check_output(options: argparse.Namespace) -> None:
 
 
 def _record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
-    config = _run_config(options.run, {"env.engine": "auto"} | overrides)
+    config = _agent_config(options.run, overrides)
 
     from star import record
 
@@ -558,6 +569,11 @@ def _settings(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 def _refuse(overrides: dict[str, Any]) -> None:
     for key in overrides:
         raise ConfigError(f"--{key}: this command takes no settings")
+
+
+def _agent_config(run_dir: Path, overrides: dict[str, Any]) -> Config:
+    """That of a run, to act on this machine, whatever it was trained on."""
+    return _run_config(run_dir, {"env.engine": "auto", "trainer.devices": 1} | overrides)
 
 
 def _run_config(run_dir: Path, overrides: dict[str, Any]) -> Config:

@@ -423,6 +423,7 @@ class TrainerConfig(Section):
     )
     rollbacks: Positive = Field(3, description="on_non_finite rollback: of one seed, before the run stops after all")
     device: Literal["auto", "cpu", "gpu"] = Field("auto", description="where to train")
+    devices: Positive = Field(1, description="GPUs (or others) that share the environments of each seed")
     sinks: tuple[Literal["tensorboard", "wandb"], ...] = Field(
         (), description="where metrics go besides metrics.jsonl: tensorboard, wandb"
     )
@@ -462,6 +463,22 @@ class Config(Section):
                     f"{name}.ppo.minibatches: {section.ppo.minibatches} does not divide the rollout of {rollout} "
                     f"decisions ({decisions} of each of {self.trainer.num_envs} environments)"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _devices_share_evenly(self) -> Self:
+        devices, num_envs = self.trainer.devices, self.trainer.num_envs
+        shared = [("trainer.num_envs", num_envs, num_envs)]
+        for name, section, decisions in self.learners():
+            if section.learner == "td3":
+                shared.append((f"{name}.td3.buffer_size", section.td3.buffer_size, section.td3.buffer_size))
+            else:
+                batch = decisions * num_envs // section.ppo.minibatches
+                shared.append((f"{name}.ppo.minibatches", section.ppo.minibatches, batch))
+        for key, value, size in shared:
+            if size % devices:
+                of = "" if size == value else f" makes minibatches of {size}, which"
+                raise ValueError(f"{key}: {value}{of} cannot be shared evenly by trainer.devices {devices}")
         return self
 
     @model_validator(mode="after")

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from envs.vector import VectorEnv
 from star import abstraction as regions
-from star import adjacency, commander, controller, episode, faults, forward_model, learner, refinement, tutor
+from star import adjacency, commander, controller, devices, episode, faults, forward_model, learner, refinement, tutor
 from star.commander import CommanderState, Decision, Successors
 from star.config import AgentConfig
 from star.episode import Episode, Steps, Streams
@@ -49,6 +49,7 @@ def epoch(
     """One episode of all environments, its updates, one refinement. `teachers` are those of `config.sgim.teachers`."""
     key, reset_key, scan_key, end_key = jax.random.split(state.key, 4)
     streams = episode.start(spec, env, practice=commander.practice(config.commander), key=reset_key)
+    streams = devices.share(streams)
     if config.sgim.enabled:
         lesson_key = jax.random.fold_in(reset_key, 1)
         state, streams = _begin_lesson(config, spec, env, state, teachers, streams, key=lesson_key)
@@ -68,7 +69,7 @@ def epoch(
         end_key, near_key = jax.random.split(end_key)
         near, more = adjacency.train(config.tutor.adjacency, state.adjacency, spec.space, key=near_key)
         state, metrics = state.replace(adjacency=near), metrics | _prefix("adjacency", more)
-    outcomes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), outcomes)
+    outcomes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), devices.whole(outcomes))
     if config.commander.enabled:
         epsilon = commander.epsilon(config.commander, _env_steps(spec, env, state))
         state, more = _learn_between_episodes(config, spec, state, outcomes, env.num_envs, key=end_key)
@@ -113,7 +114,7 @@ def _end_lesson(config: AgentConfig, spec: Spec, state: TrainState, streams: Str
     assert lesson is not None
     assert state.sgim is not None
     over = jnp.ones_like(lesson.taught)
-    lesson = strategies.grade(lesson, over, streams.episode.distance, radius=spec.success_radius)
+    lesson = devices.whole(strategies.grade(lesson, over, streams.episode.distance, radius=spec.success_radius))
     learnt, metrics = strategies.learn(config.sgim, state.sgim, lesson)
     return state.replace(sgim=learnt), metrics
 
@@ -225,14 +226,16 @@ def _segment(
     streams = episode.advance(config, streams)
     decision, outcome = finished_period(config, spec, state, streams, steps)
     if config.commander.enabled:
-        state = state.replace(commander=_command_better(config, spec, state, allowed, decision, number))
+        known = _command_better(config, spec, state, allowed, devices.whole(decision), number)
+        state = state.replace(commander=known)
     transition = None
     if tutor_action is not None:
         transition = _tutor_transition(config, spec, streams, began, tutor_action, steps)
         metrics |= {"tutor/reward": transition.reward.mean()}
     if state.adjacency is not None:
         path = spec.abstract(jnp.concatenate([began[None], steps.next_obs]))
-        near = adjacency.observe(config.tutor.adjacency, state.adjacency, spec.space, path, steps.alive)
+        path, alive = devices.whole((path, steps.alive))
+        near = adjacency.observe(config.tutor.adjacency, state.adjacency, spec.space, path, alive)
         state = state.replace(adjacency=near)
     counts = {
         f"env/{name}": (value * steps.alive).sum()

@@ -16,13 +16,16 @@ from star.config import ConfigError
 
 
 class JsonLines:
-    """A file with one object a line, flushed at once."""
+    """A file with one object a line, flushed at once. With `muted` it is only read: somebody else writes it."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, muted: bool = False) -> None:
         self.path = path
+        self._muted = muted
 
     def write(self, row: Mapping[str, Any]) -> None:
         """Append one line; numbers that JSON cannot hold become null."""
+        if self._muted:
+            return
         clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(clean) + "\n")
@@ -48,7 +51,7 @@ class JsonLines:
 
     def keep_until(self, env_steps: int) -> None:
         """Drop what was written after `env_steps`, for a run that goes on from there."""
-        if not self.path.exists():
+        if self._muted or not self.path.exists():
             return
         rows = [row for row in self.read() if row["env_steps"] <= env_steps]
         partial = self.path.with_suffix(".partial")
@@ -71,9 +74,10 @@ class Journal:
     faults: JsonLines
 
     @classmethod
-    def of(cls, run_dir: Path) -> Journal:
-        """That of a run directory."""
-        return cls(*(JsonLines(run_dir / f"{name}.jsonl") for name in ("metrics", "regions", "provenance", "faults")))
+    def of(cls, run_dir: Path, *, muted: bool = False) -> Journal:
+        """That of a run directory; `muted` as in `JsonLines`."""
+        names = ("metrics", "regions", "provenance", "faults")
+        return cls(*(JsonLines(run_dir / f"{name}.jsonl", muted=muted) for name in names))
 
 
 def of_epoch(metrics: dict[str, jax.Array], seeds: list[int]) -> list[dict[str, Any]]:

@@ -71,12 +71,13 @@ class Normalizer(struct.PyTreeNode):
         """Mean 0, variance 1, no data."""
         return cls(mean=jnp.zeros(size), variance=jnp.ones(size), count=jnp.zeros(()))
 
-    def update(self, batch: Float[Array, "N n"], weight: Float[Array, "N"]) -> Normalizer:
+    def update(self, batch: Float[Array, "*batch n"], weight: Float[Array, "*batch"]) -> Normalizer:
         """Fold in the rows of `batch` with weight 1; rows with weight 0 do not count."""
+        rows = tuple(range(weight.ndim))
         added = weight.sum()
         safe = jnp.maximum(added, 1.0)
-        mean = (batch * weight[:, None]).sum(0) / safe
-        variance = (jnp.square(batch - mean) * weight[:, None]).sum(0) / safe
+        mean = (batch * weight[..., None]).sum(rows) / safe
+        variance = (jnp.square(batch - mean) * weight[..., None]).sum(rows) / safe
         total = jnp.maximum(self.count + added, 1.0)
         delta = mean - self.mean
         pooled = (

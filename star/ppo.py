@@ -23,6 +23,7 @@ from flax import struct
 from flax.linen import elu
 from jaxtyping import Array, Float
 
+from star import devices
 from star.config import PPOConfig
 from star.networks import MLP, Normalizer, apply
 from star.replay import Imitation, Penalty, Transition, flatten
@@ -116,11 +117,10 @@ def update(
     (params, optimizer, learning_rate), metrics = jax.lax.scan(
         one_pass, (state.params, state.optimizer, state.learning_rate), jax.random.split(key, config.passes)
     )
-    flat = flatten(rollout)
     new_state = PPOState(
         params=params,
         optimizer=optimizer,
-        normalizer=state.normalizer.update(flat.obs, flat.weight),
+        normalizer=state.normalizer.update(rollout.obs, rollout.weight),
         learning_rate=learning_rate,
     )
     metrics = jax.tree.map(jnp.mean, metrics) | {
@@ -161,7 +161,7 @@ def _log_prob(mean: Array, std: Array, action: Array) -> Array:
 def _prepare(config: PPOConfig, state: PPOState, rollout: Transition, *, keep: bool) -> _Sample:
     """The rollout as independent samples [T * B], seen through the networks that collected it.
 
-    With `keep` the samples hold their transition too.
+    With `keep` the samples hold their transition too. Every device gets them all, to draw its shares of minibatches.
     """
     obs, next_obs = state.normalizer(rollout.obs), state.normalizer(rollout.next_obs)
     values = _value(config, state.params, obs)
@@ -176,12 +176,22 @@ def _prepare(config: PPOConfig, state: PPOState, rollout: Transition, *, keep: b
         target=advantage + values,
         weight=rollout.weight,
     )
-    return flatten(sample)
+    return flatten(devices.whole(sample))
 
 
 def _minibatches(samples: _Sample, count: int, *, key: Array) -> _Sample:
-    order = jax.random.permutation(key, samples.weight.shape[0])
-    return jax.tree.map(lambda x: x[order].reshape(count, -1, *x.shape[1:]), samples)
+    """`count` minibatches [count, N], shuffled, whose weights sum to 1 and whose advantages have mean 0 and variance 1.
+
+    Each device gets its share of each; what takes sums over a minibatch is done before, where that costs no messages.
+    """
+    order = devices.whole(jax.random.permutation(key, samples.weight.shape[0])).reshape(count, -1)
+    weight, advantage = devices.whole((samples.weight[order], samples.advantage[order]))
+    weight /= jnp.maximum(weight.sum(axis=1, keepdims=True), 1.0)
+    centred = advantage - jnp.sum(weight * advantage, axis=1, keepdims=True)
+    advantage = centred / (jnp.sqrt(jnp.sum(weight * jnp.square(centred), axis=1, keepdims=True)) + 1e-8)
+    ours = devices.share(order, axis=1)
+    batches = jax.tree.map(lambda x: x[ours], samples).replace(weight=weight, advantage=advantage)
+    return devices.share(batches, axis=1)
 
 
 def _gradient_step(
@@ -206,10 +216,7 @@ def _loss(
     params: Mapping[str, Any],
     batch: _Sample,
 ) -> tuple[Array, Metrics]:
-    share = batch.weight / jnp.maximum(batch.weight.sum(), 1.0)
-    centred = batch.advantage - jnp.sum(share * batch.advantage)
-    advantage = centred / (jnp.sqrt(jnp.sum(share * jnp.square(centred))) + 1e-8)
-
+    share, advantage = batch.weight, batch.advantage
     mean, std = _policy(config, params, batch.obs)
     log_ratio = _log_prob(mean, std, batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)

@@ -11,11 +11,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 import envs
 from envs import arena
 from envs.vector import VectorEnv
-from star import episode, hierarchy
+from star import devices, episode, hierarchy
 from star import state as states
 from star.config import AgentConfig, Config, ConfigError, TeacherConfig
 from star.episode import Episode
@@ -24,6 +25,7 @@ from star.sgim import teachers
 from star.sgim.teachers import Demonstrations
 from star.spec import Spec
 from star.state import TrainState
+from star.td3 import TD3State
 
 # Streams of random keys that no seed of training uses.
 DURING_TRAINING = 2**32 - 1
@@ -60,6 +62,10 @@ class Program:
     def init(self, keys: jax.Array) -> TrainState:
         """Fresh runs, one from each key."""
         return self.functions.init(self.agent, keys)
+
+    def example(self) -> TrainState:
+        """The shapes of `init`, and where its arrays lie."""
+        return jax.eval_shape(self.functions.init, self.agent, self.seed_keys())
 
     def epoch(self, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         """Train for an epoch; `state` is used up."""
@@ -107,8 +113,11 @@ def build(config: Config) -> Program:
     except ValueError as error:
         raise ConfigError(str(error)) from None
     test_env = make_env(config, "test")
+    mesh = devices.mesh(config.trainer.devices)
     trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
-    tested = VectorEnv(test_env, config.trainer.eval_episodes, auto_reset=False)
+    episodes = config.trainer.eval_episodes
+    surplus = -episodes % config.trainer.devices  # each device plays as many
+    tested = VectorEnv(test_env, episodes + surplus, auto_reset=False)
 
     @cache
     def lessons() -> tuple[Demonstrations, ...]:
@@ -121,14 +130,23 @@ def build(config: Config) -> Program:
         def one_epoch(one: AgentConfig, state: TrainState) -> Any:
             return hierarchy.epoch(one, spec, trained, state, teachers=lessons)
 
-        return jax.vmap(one_epoch, in_axes=(_axis(agent), 0))(agent, state)
+        state, metrics = jax.vmap(one_epoch, in_axes=(_axis(agent), 0))(agent, state)
+        return _as_on_first(state, placement), metrics
 
     def evaluate(agent: AgentConfig, state: TrainState, keys: jax.Array) -> Any:
         def one_evaluation(one: AgentConfig, state: TrainState, key: jax.Array) -> Any:
-            return episode.evaluate(one, spec, tested, state, key=key)
+            played = episode.evaluate(one, spec, tested, state, key=key)
+            return jax.tree.map(lambda x: x[:episodes], devices.whole(played))
 
         return jax.vmap(one_evaluation, in_axes=(_axis(agent), 0, 0))(agent, state, keys)
 
+    placement = _placement(mesh, jax.eval_shape(init, config.agent(), seed_keys([0])))
+    everywhere = devices.everywhere(mesh)
+    functions = Functions(
+        init=jax.jit(init, out_shardings=placement),
+        epoch=jax.jit(devices.on(mesh, epoch), donate_argnums=2, out_shardings=(placement, everywhere)),
+        evaluate=jax.jit(devices.on(mesh, evaluate), out_shardings=everywhere),
+    )
     return Program(
         config=config,
         spec=spec,
@@ -136,7 +154,7 @@ def build(config: Config) -> Program:
         goal=_a_goal(spec, test_env),
         agent=config.agent(),
         lessons=lessons,
-        functions=Functions(jax.jit(init), jax.jit(epoch, donate_argnums=2), jax.jit(evaluate)),
+        functions=functions,
     )
 
 
@@ -197,6 +215,29 @@ def evaluation_keys(seeds: Sequence[int], numbers: Sequence[int] | np.ndarray, *
     base, fold = jax.random.key(stream), jax.random.fold_in
     return jax.vmap(lambda number, seed: fold(fold(base, number), seed))(
         np.asarray(numbers, np.uint32), np.asarray(seeds, np.uint32)
+    )
+
+
+def _placement(mesh: Mesh | None, state: TrainState) -> TrainState:
+    """Where the leaves of `state` lie between epochs: the rings of the levels in shares, all else whole."""
+    places = jax.tree.map(lambda _: devices.everywhere(mesh), state)
+    slots = devices.in_shares(mesh, axis=2)  # of rings [seeds, 1, slots, ...]
+
+    def cut(level: Any) -> Any:
+        if not isinstance(level, TD3State):
+            return level
+        return level.replace(ring=level.ring.replace(experience=jax.tree.map(lambda _: slots, level.ring.experience)))
+
+    return places.replace(tutor=cut(places.tutor), controller=cut(places.controller))
+
+
+def _as_on_first(state: TrainState, placement: TrainState) -> TrainState:
+    """`state` with the first device's values in all that is whole on each."""
+    leaves, structure = jax.tree.flatten(state)
+    copies = [place.is_fully_replicated for place in jax.tree.leaves(placement)]
+    same = iter(devices.as_on_first([leaf for leaf, copy in zip(leaves, copies, strict=True) if copy]))
+    return jax.tree.unflatten(
+        structure, [next(same) if copy else leaf for leaf, copy in zip(leaves, copies, strict=True)]
     )
 
 

@@ -16,17 +16,19 @@ _ROOT = Path(__file__).parents[1]
 _PACKAGES = ("star-rl", "jax", "mujoco", "mujoco-mjx", "brax")
 
 
-def here() -> dict[str, Any]:
+def here(*, devices: int = 1) -> dict[str, Any]:
     """`time` (UTC), `commit`, `device`, `python` and the `versions` of packages, of this process.
 
-    `commit` is that of the checkout which the code lies in, with a + if it was changed; empty where there is none.
+    `device` is the kind of the first one, and how many are used if there are several, `devices`. `commit` is that of
+    the checkout which the code lies in, with a + if it was changed; empty where there is none.
     """
     device = jax.devices()[0]
     cores = len(os.sched_getaffinity(0))
+    kind = device.device_kind if device.platform == "gpu" else f"CPU, {cores} core{'s' * (cores > 1)}"
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": _commit(),
-        "device": device.device_kind if device.platform == "gpu" else f"CPU, {cores} core{'s' * (cores > 1)}",
+        "device": f"{devices} x {kind}" if devices > 1 else kind,
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in _PACKAGES},
     }

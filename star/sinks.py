@@ -181,13 +181,18 @@ class Sinks:
     After an exception the end does not wait either.
     """
 
-    def __init__(self, run_dir: Path, config: Config, history: Sequence[Row], *, warn: Warn) -> None:
-        """`history` holds the rows of `metrics.jsonl`; `warn` takes one line and is called from other threads."""
+    def __init__(
+        self, run_dir: Path, config: Config, history: Sequence[Row], *, warn: Warn, muted: bool = False
+    ) -> None:
+        """`history` holds the rows of `metrics.jsonl`; `warn` takes one line and is called from other threads.
+
+        With `muted` there is no sink: somebody else tells them.
+        """
         makers: dict[str, Callable[[], Sink]] = {
             "tensorboard": partial(TensorBoard, run_dir, config, list(history)),
             "wandb": partial(WandB, run_dir, config, warn=warn),
         }
-        self._workers = [Worker(name, makers[name], warn=warn) for name in config.trainer.sinks]
+        self._workers = [Worker(name, makers[name], warn=warn) for name in config.trainer.sinks if not muted]
 
     def write(self, rows: Sequence[Row]) -> None:
         """Hand on the rows of one epoch, one per seed."""

@@ -160,7 +160,7 @@ class Plan:
     @property
     def description(self) -> dict[str, Any]:
         """What must be equal for workers to share a study. How many trials, and on what machine, may differ."""
-        values = self.base.model_dump(mode="json", exclude={"env": {"engine"}, "trainer": {"device"}})
+        values = self.base.model_dump(mode="json", exclude={"env": {"engine"}, "trainer": {"device", "devices"}})
         about = self.file.model_dump(
             mode="json", include={"parameters", "sampler", "pruner", "prune_after", "objective", "summary"}
         )
@@ -204,6 +204,8 @@ def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: An
     base = load(
         folder / sweep.config, sweep.settings | dict(settings or {}), layers=[folder / layer for layer in sweep.layers]
     )
+    if base.trainer.devices > 1 or "trainer.devices" in sweep.parameters:
+        raise ConfigError(f"{path}: trainer.devices: a sweep trains on 1; start a worker for each device, with --out")
     for key, parameter in sweep.parameters.items():
         for value in parameter.ends:
             check_setting(base, key, value, source=f"{path}: parameters")

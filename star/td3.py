@@ -20,7 +20,7 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from star import replay
+from star import devices, replay
 from star.config import TD3Config
 from star.networks import MLP, apply
 from star.replay import Imitation, Penalty, Transition, flatten
@@ -99,7 +99,7 @@ def update(
     `penalty(batch, action)` [N] is added to the loss of the actor that would take `action`, and so is that of
     `imitation`.
     """
-    state = state.replace(ring=replay.add(state.ring, flatten(rollout)))
+    state = state.replace(ring=replay.add(state.ring, flatten(devices.whole(rollout))))
     state, metrics = jax.lax.scan(
         partial(_one_update, config, relabel, penalty, imitation),
         state,
@@ -117,7 +117,7 @@ def _one_update(
     key: Array,
 ) -> tuple[TD3State, Metrics]:
     sample_key, noise_key, relabel_key = jax.random.split(key, 3)
-    batch = replay.sample(state.ring, sample_key, batch_size=config.batch_size)
+    batch = devices.whole(replay.sample(state.ring, sample_key, batch_size=config.batch_size))
     if relabel is not None:
         batch = relabel(batch, relabel_key)
     ready = replay.filled(state.ring) >= min(config.min_transitions, replay.capacity(state.ring))

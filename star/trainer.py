@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from star import checkpoint, evaluation, faults, profiling, provenance, report, sinks
+from star import checkpoint, devices, evaluation, faults, profiling, provenance, report, sinks
 from star import program as programs
 from star.checkpoint import Checkpoints
 from star.config import Config, ConfigError
@@ -52,22 +52,24 @@ def train(
     """Train to the end, or go on with the run in `run_dir`. Ctrl-C writes a checkpoint and returns.
 
     Where numbers are no longer finite, it returns too, or goes back and on, as `trainer.on_non_finite` says.
-    `profile` is the number of epochs that JAX's profiler traces, to `run_dir/profile`.
+    `profile` is the number of epochs that JAX's profiler traces, to `run_dir/profile`. Several processes
+    (`devices.join`) call this alike, and only the first of them writes anything but its share of the checkpoints.
     """
-    console = console or Console(stderr=True)
     sinks.check(config)
     program = programs.build(config)
     program.lessons()  # refused before anything is written
+    console = console or Console(stderr=True, quiet=not devices.first())
     checkpoints = Checkpoints(run_dir, keep=config.trainer.keep_checkpoints)
+    profile *= devices.first()
     traced = _traced(program, checkpoints, profile) if profile else 0
-    journal = Journal.of(run_dir)
+    journal = Journal.of(run_dir, muted=not devices.first())
     if resume:
         state = _restore(program, checkpoints, journal)
     else:
         _prepare(run_dir, program.config)
-        state = jax.device_put(program.init(program.seed_keys()), jax.devices()[0])  # as a restored one is
-    began = int(state.epoch[0]) * program.env_steps_per_epoch
-    journal.provenance.write({"env_steps": began} | provenance.here())
+        state = program.init(program.seed_keys())
+    began = _epochs(state) * program.env_steps_per_epoch
+    journal.provenance.write({"env_steps": began} | provenance.here(devices=config.trainer.devices))
     if config.trainer.on_non_finite == "rollback" and not checkpoints.steps():
         checkpoints.save(0, state, program.config, success=0.0)  # there is always one to go back to
     try:
@@ -142,13 +144,13 @@ def _loop(
     profile: tuple[int, int],
 ) -> Result:
     config, seeds = program.config.trainer, program.seeds
-    done, fault = int(state.epoch[0]), None
+    done, fault = _epochs(state), None
     saved = done if checkpoints.steps() else -1
     stopwatch = Stopwatch()
     display = Display(
         console,
         stopwatch,
-        title=f"{program.config.env.name} on {jax.default_backend()}, {_named(seeds)}",
+        title=f"{program.config.env.name} on {_machine(config.devices)}, {_named(seeds)}",
         total_env_steps=program.epochs * program.env_steps_per_epoch,
         done_env_steps=done * program.env_steps_per_epoch,
         quiet=quiet,
@@ -158,9 +160,9 @@ def _loop(
         checkpoints.save(done * program.env_steps_per_epoch, state, program.config, success=records.success or 0.0)
 
     trace = Profile(run_dir / "profile", first=profile[0], epochs=profile[1], say=display.say, warn=display.warn)
-    with Sinks(run_dir, program.config, records.rows, warn=display.warn) as others:
+    with Sinks(run_dir, program.config, records.rows, warn=display.warn, muted=not devices.first()) as others:
         with display, trace, interruptible(display.stop) as interrupted:
-            while done < program.epochs and fault is None and not interrupted():
+            while done < program.epochs and fault is None and not devices.anywhere(interrupted()):
                 trace.before(done)
                 with stopwatch.measure("epoch"):
                     state, metrics = program.epoch(state)
@@ -181,14 +183,15 @@ def _loop(
                     with stopwatch.measure("checkpoint"):
                         save()
                     saved = done
-            stopped = interrupted() if fault else done < program.epochs
+            stopped = devices.anywhere(interrupted()) if fault else done < program.epochs
             if fault is None and saved != done:
                 save()
         env_steps = done * program.env_steps_per_epoch
         known = records.regions and records.regions[-1]["env_steps"] == env_steps
         if fault is None and not known:  # stopped between evaluations
             records.add_regions(state, env_steps=env_steps, write=False)
-        _draw(run_dir / "figures", records)
+        if devices.first():
+            _draw(run_dir / "figures", records)
         others.figures(run_dir / "figures")
     steps = checkpoints.steps()
     return Result(run_dir, env_steps, stopped, records.success, fault, saved=steps[-1] if steps else None)
@@ -200,8 +203,10 @@ def _goes_back(program: Program, checkpoints: Checkpoints, journal: Journal, fau
     number = {seed: 1 + sum(row["seed"] == seed for row in rolled) for seed in fault.found}
     back = config.on_non_finite == "rollback" and all(n <= config.rollbacks for n in number.values())
     to = checkpoints.steps()[-1] if back else None
+    devices.wait("all processes know of the faults before")
     for seed, found in fault.found.items():
         journal.faults.write({"env_steps": fault.env_steps, "seed": seed, "back_to": to, "found": found})
+    devices.wait("the fault is in the journal")
     if back:
         whose = ", ".join(
             f"{config.rollback_factor**n:g} for seed {seed} ({n} of {config.rollbacks})" for seed, n in number.items()
@@ -219,7 +224,7 @@ def _slowed(program: Program, state: TrainState, journal: Journal) -> tuple[Prog
     rolled, config = _rollbacks(journal), program.config.trainer
     if not rolled and config.on_non_finite == "stop":
         return program, state
-    env_steps = int(state.epoch[0]) * program.env_steps_per_epoch
+    env_steps = _epochs(state) * program.env_steps_per_epoch
 
     def factors(rows: list[dict[str, Any]]) -> list[float]:
         return [config.rollback_factor ** sum(row["seed"] == seed for row in rows) for seed in program.seeds]
@@ -241,6 +246,15 @@ def _draw(folder: Path, records: _Records) -> None:
         report.growth_figure(folder / "growth.png", regions=regions, walls=walls)
     if rows and records.program.config.sgim.enabled:
         report.sgim_figure(folder / "sgim.png", regions=regions, rows=rows, walls=walls)
+
+
+def _epochs(state: TrainState) -> int:
+    """How many are over."""
+    return int(jax.device_get(state.epoch)[0])
+
+
+def _machine(count: int) -> str:
+    return (f"{count} x " if count > 1 else "") + jax.default_backend()
 
 
 def _named(seeds: list[int]) -> str:
@@ -278,6 +292,7 @@ def _restore(program: Program, checkpoints: Checkpoints, journal: Journal) -> Tr
     state = checkpoint.restore(program, checkpoints, steps[-1], source=run_dir)
     for lines in (journal.metrics, journal.regions):
         lines.keep_until(steps[-1])
+    devices.wait("the journal is that of the checkpoint")
     return state
 
 
@@ -286,6 +301,9 @@ def _prepare(run_dir: Path, config: Config) -> None:
         raise ConfigError(
             f"{run_dir}: is not empty; choose another --run-dir, or go on with it: star train --resume {run_dir}"
         )
+    devices.wait("the run directory is empty")
+    if not devices.first():
+        return
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         (run_dir / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")

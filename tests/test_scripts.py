@@ -276,3 +276,13 @@ def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_
     monkeypatch.setattr(reachability, "hull", middle)
     row = script.check_verdicts(agent, state, points=50)
     assert row["strict"]["do_not_arrive"] > 0 and row["trained"]["outside_hull"] > 0
+
+
+def test_the_benchmark_of_devices_measures_physics_and_compares_with_one_device(run):
+    script = load("benchmark_devices")
+    seconds = script.physics(programs.build(loading.load(run / "config.yaml")), 2)
+    assert len(seconds) == 2 and min(seconds) > 0
+    one = {"devices": 1, "physics": 100.0, "acting": 50.0, "epoch": 20.0}
+    two = {"devices": 2, "physics": 200.0, "acting": 90.0, "epoch": 34.0}
+    assert script.ratio(two, one) == {"physics": 2.0, "acting": 1.8, "epoch": 1.7}
+    assert script.ratio(two, two) is None

@@ -274,6 +274,36 @@ def test_a_checkpoint_of_another_shape_or_environment_is_refused(finished, overr
     assert (run_dir / "metrics.jsonl").read_bytes() == before
 
 
+def test_four_devices_train_as_one_does_and_any_number_goes_on(finished, tmp_path):
+    """Two epochs on four devices, the other two on one; its checkpoint goes to two as well."""
+    training = """
+import json, sys
+from pathlib import Path
+import jax
+from star import checkpoint, trainer
+from star import program as programs
+from star.loading import parse
+
+config, run_dir = json.loads(sys.argv[1]), Path(sys.argv[2])
+trainer.train(parse(config, {"trainer.devices": 4}), run_dir, quiet=True)
+program = programs.build(parse(config, {"trainer.devices": 2}))
+_, state = checkpoint.load_state(program, run_dir, "last")
+assert all(leaf.sharding.device_set == set(jax.devices()[:2]) for leaf in jax.tree.leaves(state))
+assert jax.device_get(state.epoch).tolist() == [2, 2]
+"""
+    run_dir, half = tmp_path / "run", TINY | {"trainer": TINY["trainer"] | {"total_env_steps": 2 * EPOCH}}
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags}
+    subprocess.run([sys.executable, "-c", training, json.dumps(half), str(run_dir)], env=environment, check=True)
+    trainer.train(tiny(), run_dir, resume=True, quiet=True)
+    for ours, theirs in zip(rows(run_dir), rows(finished[0]), strict=True):
+        assert ours.keys() == theirs.keys()
+        for key, value in theirs.items():
+            assert ours[key] == pytest.approx(value, rel=1e-3, abs=1e-4), key
+    started = Journal.of(run_dir).provenance.read()
+    assert started[0]["device"] == f"4 x {started[1]['device']}"
+
+
 def test_a_checkpoint_loads_on_a_machine_without_the_device_it_was_saved_on(tmp_path):
     saving = """
 import sys, jax, jax.numpy as jnp
