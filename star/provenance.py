@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -21,10 +22,14 @@ def here() -> dict[str, Any]:
 
     `commit` is that of the checkout which the code lies in, with a + if it was changed; empty where there is none.
     """
+    return {"time": datetime.now(UTC).isoformat(timespec="seconds")} | _process()
+
+
+@cache  # the code that runs is that of the first call, whatever becomes of the checkout
+def _process() -> dict[str, Any]:
     device = jax.devices()[0]
     cores = len(os.sched_getaffinity(0))
     return {
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": _commit(),
         "device": device.device_kind if device.platform == "gpu" else f"CPU, {cores} core{'s' * (cores > 1)}",
         "python": platform.python_version(),

@@ -90,7 +90,7 @@ def test_a_run_leaves_config_metrics_checkpoints_and_figure(finished):
     run_dir, result = finished
     assert result.env_steps == 4 * EPOCH and not result.interrupted
     assert {entry.name.split(".out.")[0] for entry in run_dir.iterdir()} == {
-        "config.yaml", "metrics.jsonl", "regions.jsonl", "provenance.jsonl", "checkpoints", "figures",
+        "config.yaml", "metrics.jsonl", "regions.jsonl", "provenance.jsonl", "checkpoints", "figures", ".lock",
         "events", "seed_0", "seed_1",
     }  # fmt: skip
     for name in ("summary", "growth", "sgim"):
