@@ -38,6 +38,7 @@ from star import cli, provenance, trainer
 from star.checkpoint import Checkpoints
 from star.loading import load
 from star.metrics import Journal
+from star.stopping import leave
 
 ROOT = Path(__file__).parents[1]
 TIMES = ("wall_s", "env_steps_per_s")
@@ -326,7 +327,7 @@ def main() -> None:
     if options.out:
         options.out.parent.mkdir(parents=True, exist_ok=True)
         options.out.write_text(text + "\n", encoding="utf-8")
-    sys.exit(failed)
+    sys.exit(leave(int(failed)))
 
 
 if __name__ == "__main__":

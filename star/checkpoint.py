@@ -60,7 +60,7 @@ class Checkpoints:
     """The checkpoints of one run directory. Only the process that trains there may save or set aside."""
 
     def __init__(self, run_dir: Path, *, keep: int = 3) -> None:
-        self._path = (run_dir / "checkpoints").absolute()
+        self._path = run_dir / "checkpoints"
         self._keep = keep
         self._arrays: ocp.Checkpointer | None = None
 
@@ -75,7 +75,7 @@ class Checkpoints:
             self._path.mkdir(parents=True, exist_ok=True)
             self._clean()
             writing.mkdir()
-            self._open().save(writing / "state", args=ocp.args.StandardSave(plain(state)))
+            self._open().save(writing.absolute() / "state", args=ocp.args.StandardSave(plain(state)))
             text = json.dumps(about | {"config": config.model_dump(mode="json")}, indent=1)
             (writing / _ABOUT).write_text(text + "\n", encoding="utf-8")
             (writing / SUMS).write_text(_sums(writing), encoding="utf-8")
@@ -96,7 +96,7 @@ class Checkpoints:
         return sorted(int(entry.name) for entry in self._path.iterdir() if entry.name.isdecimal())
 
     def best(self) -> int:
-        """Env steps of the checkpoint with the best evaluation, the latest of equals."""
+        """Env steps of the one with the best evaluation, the latest of equals; `Damaged` if one does not tell."""
         return best({step: self._success(step) for step in self.steps()})
 
     def check(self, step: int) -> None:
@@ -119,13 +119,15 @@ class Checkpoints:
                 for text in (expected, found)
             )
             wrong = [name for name in sorted(was | now) if was.get(name) != now.get(name)] or [SUMS]
-            others = f" and {len(wrong) - 1} other files" if len(wrong) > 1 else ""
-            raise Damaged(f"{path}: is damaged: {wrong[0]}{others} {'differ' if others else 'differs'} from {SUMS}")
+            fault = "is missing" if wrong[0] in was.keys() - now.keys() else f"differs from {SUMS}"
+            others = f", and {len(wrong) - 1} more are wrong" if len(wrong) > 1 else ""
+            raise Damaged(f"{path}: is damaged: {wrong[0]} {fault}{others}")
 
     def set_aside(self, step: int) -> Path:
         """Rename a damaged checkpoint, so that it is none any more; it is removed once its step is saved again."""
         aside = self._aside(step)
         try:
+            self._clean()
             self._remove(aside)
             os.rename(self._path / str(step), aside)
         except OSError as error:
@@ -160,7 +162,7 @@ class Checkpoints:
         """All that is saved at `step` by its name, such as `tutor/params/...`, as its format has it."""
         path = self._path / str(step)
         here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-        saved = self._open().metadata(path / "state").item_metadata.tree
+        saved = self._open().metadata(path.absolute() / "state").item_metadata.tree
         template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), saved)
         leaves, _ = jax.tree_util.tree_flatten_with_path(self._read(path, template))
         return {_name(place): np.asarray(leaf) for place, leaf in leaves}
@@ -177,7 +179,7 @@ class Checkpoints:
         return self._arrays
 
     def _read(self, path: Path, template: Any) -> Any:
-        return self._open().restore(path / "state", args=ocp.args.StandardRestore(template))
+        return self._open().restore(path.absolute() / "state", args=ocp.args.StandardRestore(template))
 
     def _about(self, step: int) -> About:
         """What a checkpoint says of itself, in its own format; raises `ConfigError` if that is none we read."""
@@ -193,14 +195,16 @@ class Checkpoints:
             raise ConfigError(f"{path}: checkpoint format {number} is none that this version reads, up to {FORMAT}")
         return about
 
-    def _success(self, step: int) -> float:
-        """`success_final` noted with a checkpoint; below all if it cannot be read."""
+    def _success(self, step: int, *, unreadable: float | None = None) -> float:
+        """`success_final` noted with a checkpoint; `unreadable` if it cannot be read, and without that `Damaged`."""
         path = self._path / str(step)
         noted = path / "metrics" / "metrics" if _older(path).exists() else path / _ABOUT
         try:
             return float(json.loads(noted.read_text(encoding="utf-8"))["success_final"])
-        except (OSError, ValueError, KeyError, TypeError):
-            return -1.0
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            if unreadable is not None:
+                return unreadable
+            raise Damaged(f"{path}: is damaged, its success cannot be read: {_cause(error)}") from None
 
     def _aside(self, step: int) -> Path:
         return self._path / f"{step}{_ASIDE}"
@@ -208,7 +212,7 @@ class Checkpoints:
     def _retire(self, saved: int) -> None:
         """Delete what `saved` makes superfluous."""
         self._remove(self._aside(saved))
-        successes = {step: self._success(step) for step in self.steps()}
+        successes = {step: self._success(step, unreadable=-1.0) for step in self.steps()}
         for step in successes.keys() - kept(successes, latest=self._keep):
             self._remove(self._path / str(step))
 

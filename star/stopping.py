@@ -18,7 +18,7 @@ T = TypeVar("T")
 GRACE_S = 5.0  # how long after SIGTERM the computation under way may take; the rest of 10 s is for the checkpoint
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _POLL_S = 0.2  # a signal that another thread receives does not wake this one
-_computing: set[threading.Thread] = set()
+_THREAD = "star compute"
 
 
 class Overdue(Exception):
@@ -59,15 +59,13 @@ class Stop:
                 found.set_result(compute())
             except BaseException as error:
                 found.set_exception(error)
-            finally:
-                _computing.discard(thread)
 
-        thread = threading.Thread(target=work, name="compute", daemon=True)
-        _computing.add(thread)
+        thread = threading.Thread(target=work, name=_THREAD, daemon=True)
         thread.start()
         while not wait([found], timeout=_POLL_S).done:
             if self.terminated and self._since is not None and time.monotonic() > self._since + GRACE_S:
                 raise Overdue
+        thread.join()
         return found.result()
 
 
@@ -83,9 +81,14 @@ def interruptible(on_first: Callable[[], None] = lambda: None) -> Iterator[Stop]
             signal.signal(number, handler)
 
 
+def computing() -> list[threading.Thread]:
+    """The threads that compute still, after they were abandoned."""
+    return [thread for thread in threading.enumerate() if thread.name == _THREAD]
+
+
 def leave(code: int) -> int:
     """`code`, unless a computation was abandoned: then the process ends here, for Python would crash or wait for it."""
-    if _computing:
+    if computing():
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

@@ -20,6 +20,7 @@ from star import program as programs
 from star.checkpoint import Checkpoints
 from star.config import Config, ConfigError
 from star.display import Display, Stopwatch
+from star.episode import Episode
 from star.loading import load
 from star.lock import locked
 from star.metrics import Journal, by_step, mean, of_epoch
@@ -155,6 +156,9 @@ def _loop(
         state, metrics = program.epoch(state)
         return state, of_epoch(metrics, seeds)
 
+    def evaluate(state: TrainState, done: int) -> Episode:
+        return jax.block_until_ready(program.evaluate(state, program.evaluation_keys(done)))
+
     stop.on_first = display.stop
     spare: tuple[int, TrainState] | None = None  # (epochs, state) before what may take long
     trace = Profile(run_dir / "profile", first=profile[0], epochs=profile[1], say=display.say, warn=display.warn)
@@ -174,8 +178,7 @@ def _loop(
                     env_steps = done * program.env_steps_per_epoch
                     if evaluated:
                         with stopwatch.measure("evaluation"):
-                            keys = program.evaluation_keys(done)
-                            evaluation.add_to(table, stop.during(partial(program.evaluate, state, keys)))
+                            evaluation.add_to(table, stop.during(partial(evaluate, state, done)))
                         records.add_regions(state, env_steps=env_steps)
                     records.add(table, env_steps=env_steps, speed=speed)
                     others.write(table)
@@ -193,12 +196,10 @@ def _loop(
             _draw(run_dir / "figures", records)
             others.figures(run_dir / "figures")
     except Overdue:
-        done, copy = spare or (
-            max(saved, 0),
-            None,
-        )  # what is short may take long for once: then the last checkpoint is it
-        if copy is not None and saved != done:
-            save(done, copy)
+        done = max(saved, 0)  # where it is, if what is short took long for once
+        if spare is not None and spare[0] > saved:
+            save(*spare)
+            done = spare[0]
         return Result(run_dir, done * program.env_steps_per_epoch, True, records.success, terminated=True)
     return Result(run_dir, env_steps, stopped, records.success, terminated=stop.terminated)
 
@@ -274,9 +275,8 @@ def _fresh(program: Program) -> TrainState:
 
 def _make(run_dir: Path) -> None:
     """Make the folder of a new run; what a process that was killed at once left there does no harm."""
-    if run_dir.exists() and (
-        not run_dir.is_dir() or any(not entry.name.startswith(_BEGUN) for entry in run_dir.iterdir())
-    ):
+    used = run_dir.is_dir() and any(not entry.name.startswith(_BEGUN) for entry in run_dir.iterdir())
+    if used or (run_dir.exists() and not run_dir.is_dir()):
         raise ConfigError(
             f"{run_dir}: is not empty; choose another --run-dir, or go on with it: star train --resume {run_dir}"
         )
