@@ -36,6 +36,17 @@ def whole(path: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:
             partial = Path(folder) / path.name
             yield partial
+            sync(partial)
             os.replace(partial, path)
+            sync(path.parent)
     except OSError as error:
         raise EnvError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def sync(path: Path) -> None:
+    """Have the system write a file, or the names in a folder, to the disk: what it holds survives a loss of power."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -63,7 +63,7 @@ def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace,
     run = options.runs / task / "-".join([name, *map(str, seeds), *other])
     chosen = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), *settings]
     train = ["train", f"configs/{task}.yaml", *layer(name), *chosen]
-    if (run / "checkpoints").exists():  # interrupted, or done
+    if (run / "config.yaml").exists():  # interrupted, or done
         subprocess.run([*STAR, "train", "--resume", str(run)], cwd=ROOT, check=True)
     else:
         subprocess.run([*STAR, *train, "--run-dir", str(run)], cwd=ROOT, check=True)

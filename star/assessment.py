@@ -235,6 +235,9 @@ def _plan(targets: Sequence[Target], exam: Exam, stack: contextlib.ExitStack) ->
         steps = checkpoints.steps()
         if target.checkpoint != "all" or not steps:
             steps = [checkpoint.choose(checkpoints, source, target.checkpoint)]
+        else:
+            for step in steps:
+                checkpoints.check(step)
         structure = _structure(config)
         if structure not in courses:
             episodes = config.trainer.eval_episodes

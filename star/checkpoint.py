@@ -1,29 +1,46 @@
-"""Checkpoints: whole runs on disk, written by orbax under `checkpoints/<env_steps>/` with their configuration inside.
+"""Checkpoints: whole runs on disk, each a folder `checkpoints/<env_steps>/` that appears whole or not at all.
 
-The latest few are kept and, besides, the one with the best evaluation.
+    state/       the arrays, as orbax writes them
+    about.json   format, env_steps, success_final, config, and what wrote it: commit, device, python, versions
+    SHA256SUMS   checksums of all other files, as `sha256sum --check` reads them
+
+They are written to a hidden folder, flushed to the disk, and renamed. orbax renames too, but flushes nothing and knows
+no checksums; as these must be inside before the name appears, the rename is done here. A checkpoint that is not what
+was written is `Damaged`. The latest few are kept and, besides, the one with the best evaluation.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import hashlib
+import json
+import os
+import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import orbax.checkpoint as ocp
-from orbax.checkpoint import checkpoint_managers as policies
 
+from envs import files
+from star import devices, provenance
 from star import program as programs
 from star.config import Config, ConfigError
 from star.loading import fields, parse
+from star.migrations import FORMAT, About, Arrays, migrated, migrated_arrays, readable
 from star.program import Program
 from star.state import TrainState
 
-FORMAT = 2  # since `refinement.neighbours` and `refinement.parts`
+SUMS = "SHA256SUMS"
+_ABOUT = "about.json"
+_WRITING, _LEAVING = ".partial", ".removed"  # hidden folders that a process which was killed may leave
+_ASIDE = ".damaged"
 _HARMLESS = (
     "env.engine",
     "trainer.total_env_steps",
@@ -37,50 +54,99 @@ _HARMLESS = (
 )
 
 
+class Damaged(ConfigError):
+    """A checkpoint is not what was written."""
+
+
 class Checkpoints:
-    """The checkpoints of one run directory."""
+    """The checkpoints of one run directory. Only the process that trains there may save or set aside."""
 
     def __init__(self, run_dir: Path, *, keep: int = 3) -> None:
-        self._path = (run_dir / "checkpoints").absolute()
+        self._path = run_dir / "checkpoints"
         self._keep = keep
-        self._manager: ocp.CheckpointManager | None = None
+        self._arrays: ocp.Checkpointer | None = None
 
     def save(self, env_steps: int, state: TrainState, config: Config, *, success: float) -> None:
-        """Write `state` as `checkpoints/<env_steps>`; `success` is the latest evaluation's, which decides the best."""
-        self._open().save(
-            env_steps,
-            args=ocp.args.Composite(
-                state=ocp.args.StandardSave(_plain(state)),
-                config=ocp.args.JsonSave({"format": FORMAT, "config": config.model_dump(mode="json")}),
-            ),
-            metrics={"success_final": success},
-            force=True,
-        )
+        """Write `state` as `checkpoints/<env_steps>`; `success` is the latest evaluation's, which decides the best.
+
+        Raises `ConfigError` if that cannot be done; what was there before still is. Several processes call this alike;
+        each writes its share of the arrays, the first one the rest.
+        """
+        about = {"format": FORMAT, "env_steps": env_steps, "success_final": success}
+        about |= provenance.here(devices=config.trainer.devices)
+        target, writing = self._path / str(env_steps), self._path / f".{env_steps}{_WRITING}"
+        try:
+            if devices.first():
+                self._path.mkdir(parents=True, exist_ok=True)
+                self._clean()
+                writing.mkdir()
+            devices.wait("there is a folder to write to")
+            self._open().save(writing.absolute() / "state", args=ocp.args.StandardSave(plain(state)))
+            if devices.first():
+                text = json.dumps(about | {"config": config.model_dump(mode="json")}, indent=1)
+                (writing / _ABOUT).write_text(text + "\n", encoding="utf-8")
+                (writing / SUMS).write_text(_sums(writing), encoding="utf-8")
+                for path in (*writing.rglob("*"), writing):
+                    files.sync(path)
+                self._remove(target)
+                os.rename(writing, target)
+                files.sync(self._path)
+                self._retire(env_steps)
+            devices.wait("the checkpoint is there")
+        except (OSError, ValueError, RuntimeError) as error:  # of all these kinds are those of the library that writes
+            shutil.rmtree(writing, ignore_errors=True)
+            raise ConfigError(f"{target}: cannot be written: {_cause(error)}; earlier ones are intact") from None
 
     def steps(self) -> list[int]:
         """Env steps of the checkpoints on disk, oldest first."""
         if not self._path.is_dir():
             return []
-        return sorted(int(entry.name) for entry in self._path.iterdir() if entry.name.isdigit())
+        return sorted(int(entry.name) for entry in self._path.iterdir() if entry.name.isdecimal())
 
     def best(self) -> int:
-        """Env steps of the checkpoint with the best evaluation, the latest of equals."""
-        step = self._open().best_step()
-        return self.steps()[-1] if step is None else int(step)
+        """Env steps of the one with the best evaluation, the latest of equals; `Damaged` if one does not tell."""
+        return best({step: self._success(step) for step in self.steps()})
+
+    def check(self, step: int) -> None:
+        """Raise `Damaged` unless the checkpoint has the files that were written, byte for byte.
+
+        Nothing is known of those of format 2, which had no checksums.
+        """
+        path = self._path / str(step)
+        if _older(path).exists():
+            return
+        try:
+            expected, found = (path / SUMS).read_text(encoding="utf-8"), _sums(path)
+        except FileNotFoundError:
+            raise Damaged(f"{path}: is damaged: {SUMS} is missing") from None
+        except (OSError, ValueError) as error:
+            raise Damaged(f"{path}: is damaged: {_cause(error)}") from None
+        if expected != found:
+            was, now = (
+                dict(line.split("  ", 1)[::-1] for line in text.splitlines() if "  " in line)
+                for text in (expected, found)
+            )
+            wrong = [name for name in sorted(was | now) if was.get(name) != now.get(name)] or [SUMS]
+            fault = "is missing" if wrong[0] in was.keys() - now.keys() else f"differs from {SUMS}"
+            others = f", and {len(wrong) - 1} more are wrong" if len(wrong) > 1 else ""
+            raise Damaged(f"{path}: is damaged: {wrong[0]} {fault}{others}")
+
+    def set_aside(self, step: int) -> Path:
+        """Rename a damaged checkpoint, so that it is none any more; it is removed once its step is saved again."""
+        aside = self._aside(step)
+        if not devices.first():
+            return aside
+        try:
+            self._clean()
+            self._remove(aside)
+            os.rename(self._path / str(step), aside)
+        except OSError as error:
+            raise ConfigError(f"{aside}: cannot be written: {error.strerror}") from None
+        return aside
 
     def config(self, step: int) -> Config:
         """The configuration inside a checkpoint."""
-        path = self._path / str(step)
-        try:
-            saved = self._open().restore(step, args=ocp.args.Composite(config=ocp.args.JsonRestore()))["config"]
-            number = saved["format"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"{path}: is damaged, its config cannot be read: {_reason(error)}") from None
-        if isinstance(number, int) and number > FORMAT:
-            raise ConfigError(f"{path}: checkpoint format {number} is newer than {FORMAT}, which this version reads")
-        if number != FORMAT:
-            raise ConfigError(f"{path}: checkpoint format {number} is not {FORMAT}")
-        return parse(saved["config"], source=str(path))
+        return parse(migrated(self._about(step))["config"], source=str(self._path / str(step)))
 
     def restore(self, step: int, example: TrainState) -> TrainState:
         """The state saved at `step`, whatever devices it was saved on.
@@ -88,47 +154,119 @@ class Checkpoints:
         `example` (arrays or their shapes) gives the structure it must have, and the devices: else the first one here.
         """
         here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-        shapes = jax.eval_shape(_plain, example)
+        shapes = jax.eval_shape(plain, example)
         template = jax.tree.map(
             lambda x, like: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=getattr(like, "sharding", None) or here),
             shapes,
             example,
         )
-        args = ocp.args.Composite(state=ocp.args.StandardRestore(template))
+        path, number = self._path / str(step), self._about(step)["format"]
         hook, sys.unraisablehook = sys.unraisablehook, partial(_report, sys.unraisablehook)
         try:
-            saved = self._open().restore(step, args=args)["state"]
+            if number == FORMAT:
+                saved = self._read(path, template)
+            else:
+                saved = _assembled(migrated_arrays(self.arrays(step), number), template)
         except (OSError, ValueError, KeyError, TypeError) as error:  # the hook stays, for reads that end after this
-            raise ConfigError(
-                f"{self._path / str(step)}: is damaged, or not a checkpoint of this configuration: {_reason(error)}"
-            ) from None
+            raise Damaged(f"{path}: is damaged, or not a checkpoint of this configuration: {_reason(error)}") from None
         sys.unraisablehook = hook
         return _with_keys(saved, example)
 
+    def arrays(self, step: int) -> Arrays:
+        """All that is saved at `step` by its name, such as `tutor/params/...`, as its format has it."""
+        path = self._path / str(step)
+        here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        saved = self._open().metadata(path.absolute() / "state").item_metadata.tree
+        template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), saved)
+        leaves, _ = jax.tree_util.tree_flatten_with_path(self._read(path, template))
+        return {_name(place): np.asarray(leaf) for place, leaf in leaves}
+
     def close(self) -> None:
         """Release orbax's threads."""
-        if self._manager is not None:
-            self._manager.close()
-            self._manager = None
+        if self._arrays is not None:
+            self._arrays.close()
+            self._arrays = None
 
-    def _open(self) -> ocp.CheckpointManager:
-        if self._manager is None:
-            keep = policies.AnyPreservationPolicy(
-                [
-                    policies.LatestN(self._keep),
-                    policies.BestN(get_metric_fn=_success, n=1, keep_checkpoints_without_metrics=False),
-                ]
-            )
-            self._manager = ocp.CheckpointManager(
-                self._path,
-                options=ocp.CheckpointManagerOptions(
-                    preservation_policy=keep,
-                    best_fn=_success,
-                    enable_async_checkpointing=False,
-                ),
-                item_names=("state", "config"),
-            )
-        return self._manager
+    def _open(self) -> ocp.Checkpointer:
+        if self._arrays is None:
+            self._arrays = ocp.Checkpointer(ocp.StandardCheckpointHandler())
+        return self._arrays
+
+    def _read(self, path: Path, template: Any) -> Any:
+        return self._open().restore(path.absolute() / "state", args=ocp.args.StandardRestore(template))
+
+    def _about(self, step: int) -> About:
+        """What a checkpoint says of itself, in its own format; raises `ConfigError` if that is none we read."""
+        path = self._path / str(step)
+        try:
+            about = json.loads((_older(path) if _older(path).exists() else path / _ABOUT).read_text(encoding="utf-8"))
+            number = about["format"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise Damaged(f"{path}: is damaged, its config cannot be read: {_reason(error)}") from None
+        if isinstance(number, int) and number > FORMAT:
+            raise ConfigError(f"{path}: checkpoint format {number} is newer than {FORMAT}, which this version reads")
+        if not readable(number):
+            raise ConfigError(f"{path}: checkpoint format {number} is none that this version reads, up to {FORMAT}")
+        return about
+
+    def _success(self, step: int, *, unreadable: float | None = None) -> float:
+        """`success_final` noted with a checkpoint; `unreadable` if it cannot be read, and without that `Damaged`."""
+        path = self._path / str(step)
+        noted = path / "metrics" / "metrics" if _older(path).exists() else path / _ABOUT
+        try:
+            return float(json.loads(noted.read_text(encoding="utf-8"))["success_final"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            if unreadable is not None:
+                return unreadable
+            raise Damaged(f"{path}: is damaged, its success cannot be read: {_cause(error)}") from None
+
+    def _aside(self, step: int) -> Path:
+        return self._path / f"{step}{_ASIDE}"
+
+    def _retire(self, saved: int) -> None:
+        """Delete what `saved` makes superfluous."""
+        self._remove(self._aside(saved))
+        successes = {step: self._success(step, unreadable=-1.0) for step in self.steps()}
+        for step in successes.keys() - kept(successes, latest=self._keep):
+            self._remove(self._path / str(step))
+
+    def _remove(self, path: Path) -> None:
+        """Delete a checkpoint: its name goes first, so that no half of it is ever one."""
+        if path.exists():
+            leaving = path.with_name(f".{path.name}{_LEAVING}")
+            os.rename(path, leaving)
+            shutil.rmtree(leaving)
+
+    def _clean(self) -> None:
+        """Delete what a process that was killed had not finished."""
+        for entry in self._path.iterdir():
+            if entry.name.startswith(".") and entry.name.endswith((_WRITING, _LEAVING)):
+                shutil.rmtree(entry)
+
+
+def best(successes: Mapping[int, float]) -> int:
+    """The step with the highest success, the latest of equals."""
+    return max(successes, key=lambda step: (successes[step], step))
+
+
+def kept(successes: Mapping[int, float], *, latest: int) -> set[int]:
+    """The steps whose checkpoints stay: the `latest` ones, and the best."""
+    return {*sorted(successes)[-latest:], best(successes)}
+
+
+def newest(checkpoints: Checkpoints) -> tuple[int, dict[int, Damaged]]:
+    """Env steps of the newest checkpoint that is not damaged, and what is wrong with each that is newer.
+
+    Raises `Damaged` if there is none.
+    """
+    wrong: dict[int, Damaged] = {}
+    for step in reversed(checkpoints.steps()):
+        try:
+            checkpoints.check(step)
+            return step, wrong
+        except Damaged as error:
+            wrong[step] = error
+    raise Damaged(f"{next(iter(wrong.values()))}, and there is no other that is not")
 
 
 def load_state(program: Program, run_dir: Path, wanted: str) -> tuple[int, TrainState]:
@@ -149,17 +287,26 @@ def opened(run_dir: Path) -> Iterator[Checkpoints]:
 
 
 def choose(checkpoints: Checkpoints, run_dir: Path, wanted: str) -> int:
-    """Env steps of the checkpoint of `run_dir` that a user wants: "last", "best" or its env steps."""
+    """Env steps of the checkpoint of `run_dir` that a user wants: "last", "best" or its env steps.
+
+    If the last one is damaged, that is said on stderr, and it is the one before it. Any other raises `Damaged` then.
+    """
     steps = checkpoints.steps()
     if not steps:
         raise ConfigError(f"{run_dir}: holds no checkpoint")
     if wanted == "last":
-        return steps[-1]
+        step, wrong = newest(checkpoints)
+        for error in wrong.values():
+            print(f"warning: {error}; instead of it, this is of {step:,} env steps", file=sys.stderr)
+        return step
     if wanted == "best":
-        return checkpoints.best()
-    if wanted.isdecimal() and int(wanted) in steps:
-        return int(wanted)
-    raise ConfigError(f"--checkpoint: {wanted!r} is not among last, best, {', '.join(map(str, steps))}")
+        step = checkpoints.best()
+    elif wanted.isdecimal() and int(wanted) in steps:
+        step = int(wanted)
+    else:
+        raise ConfigError(f"--checkpoint: {wanted!r} is not among last, best, {', '.join(map(str, steps))}")
+    checkpoints.check(step)
+    return step
 
 
 def restore(program: Program, checkpoints: Checkpoints, step: int, *, source: Path) -> TrainState:
@@ -196,13 +343,19 @@ def check_compatible(saved: Config, wanted: Config, *, source: Path) -> None:
 
     Numeric hyperparameters may change; the environment, shapes and algorithms may not.
     """
+    for key, old, new in differences(saved, wanted):
+        raise ConfigError(f"{source}: its checkpoint was made with {key} {old}, not {new}")
+
+
+def differences(saved: Config, wanted: Config) -> Iterator[tuple[str, Any, Any]]:
+    """(key, value in `saved`, value in `wanted`) of the settings that make them different runs."""
     before, after = (config.model_dump(mode="json") for config in (saved, wanted))
     for key, default, _ in fields():
         if isinstance(default, float) or key.startswith(_HARMLESS):
             continue
         old, new = _lookup(before, key), _lookup(after, key)
         if old != new:
-            raise ConfigError(f"{source}: its checkpoint was made with {key} {old}, not {new}")
+            yield key, old, new
 
 
 def _lookup(values: dict[str, Any], dotted: str) -> Any:
@@ -221,15 +374,55 @@ def _report(hook: Callable[[Any], Any], failure: Any) -> None:
         hook(failure)
 
 
-def _success(metrics: Any) -> float:
-    return metrics["success_final"]
+def _older(path: Path) -> Path:
+    """Where a checkpoint of format 2 has what is in `about.json` now."""
+    return path / "config" / "metadata"
+
+
+def _sums(path: Path) -> str:
+    """What `sha256sum` prints for all files below `path` but its `SHA256SUMS`, in the order of their names."""
+    lines = []
+    for entry in sorted(path.rglob("*")):
+        if entry.is_file() and entry != path / SUMS:
+            with entry.open("rb") as file:
+                lines.append(
+                    f"{hashlib.file_digest(file, 'sha256').hexdigest()}  {entry.relative_to(path).as_posix()}\n"
+                )
+    return "".join(lines)
+
+
+def _cause(error: Exception) -> str:
+    """Why something could not be read or written, in a few words; libraries hide the system's in their own."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    known = (os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EFBIG))
+    return next((text for text in known if text in str(error)), _reason(error))
+
+
+def _name(place: tuple[Any, ...]) -> str:
+    """That of a leaf, such as `tutor/optimizer/1/count`, the same in a `TrainState` and in what orbax reads without."""
+    return "/".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in place)
+
+
+def _assembled(arrays: Arrays, template: Any) -> Any:
+    """`arrays` in the structure of `template`, whose leaves give shape, type and sharding; raises `ValueError`."""
+
+    def leaf(place: tuple[Any, ...], like: jax.ShapeDtypeStruct) -> jax.Array:
+        found = arrays.get(_name(place))
+        if found is None:
+            raise ValueError(f"{_name(place)} is missing")
+        if (found.shape, found.dtype) != (like.shape, like.dtype):
+            raise ValueError(f"{_name(place)} is {found.dtype}{list(found.shape)}, not {like.dtype}{list(like.shape)}")
+        return jax.device_put(found, like.sharding)
+
+    return jax.tree_util.tree_map_with_path(leaf, template)
 
 
 def _is_key(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
-def _plain(state: TrainState) -> TrainState:
+def plain(state: TrainState) -> TrainState:
     """Random keys as the integers they are made of, which is what can be written."""
     return jax.tree.map(lambda x: jax.random.key_data(x) if _is_key(x) else x, state)
 

@@ -16,6 +16,7 @@ from rich.console import Console
 
 from star.config import Config, ConfigError, TrainerConfig
 from star.loading import fields, load, parse, read_yaml
+from star.stopping import leave
 
 if TYPE_CHECKING:
     from star.trainer import Result
@@ -67,14 +68,19 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code: 0 done, 2 bad input, 3 numbers not finite, 130 interrupted."""
+    """Run the command; returns the exit code.
+
+    0: done, or stopped by SIGTERM with a checkpoint. 2: bad input, or a file that cannot be read or written.
+    3: numbers that are not finite. 130: interrupted.
+    """
     try:
-        return _run(sys.argv[1:] if arguments is None else list(arguments))
+        code = _run(sys.argv[1:] if arguments is None else list(arguments))
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
+        code = 2
     except KeyboardInterrupt:
-        return 130
+        code = 130
+    return leave(code)
 
 
 def _run(arguments: list[str]) -> int:
@@ -309,7 +315,7 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         return 3
     if result.interrupted:
         print(f"interrupted at {result.env_steps:,} env steps; go on with: star train --resume {run_dir}")
-        return 130
+        return 0 if result.terminated else 130
     success = "" if result.success_final is None else f", success_final {result.success_final:.2f} on test goals"
     print(f"trained {result.env_steps:,} env steps{success}")
     print(f"figure:  {run_dir}/figures/summary.png\nmetrics: {run_dir}/metrics.jsonl\nnext:    star evaluate {run_dir}")

@@ -62,6 +62,10 @@ class Stopwatch:
         """Seconds that the last of these took."""
         return self._took[part][-1]
 
+    def expected(self, *parts: str) -> float:
+        """Seconds that these parts will take if each does as the last did; without end if one was never timed."""
+        return sum(self._took[part][-1] if part in self._took else float("inf") for part in parts)
+
     def compiling(self) -> float | None:
         """Seconds since the part that compiles now began, if one does."""
         first = self._part in _COMPILED and self._part not in self._took

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -12,11 +13,15 @@ from typing import Any
 
 import jax
 
+from envs import EnvError, files
 from star.config import ConfigError
 
 
 class JsonLines:
-    """A file with one object a line, flushed at once. With `muted` it is only read: somebody else writes it."""
+    """A file with one object a line, flushed at once. A row that cannot be written raises `ConfigError`.
+
+    With `muted` it is only read: somebody else writes it.
+    """
 
     def __init__(self, path: Path, *, muted: bool = False) -> None:
         self.path = path
@@ -27,8 +32,17 @@ class JsonLines:
         if self._muted:
             return
         clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(clean) + "\n")
+        try:
+            before = self.path.stat().st_size if self.path.exists() else 0
+            try:
+                with self.path.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(clean) + "\n")
+            except OSError:
+                with contextlib.suppress(OSError):  # half a line, on a disk that is full
+                    os.truncate(self.path, before)
+                raise
+        except OSError as error:
+            raise ConfigError(f"{self.path}: cannot be written: {error.strerror}") from None
 
     def read(self) -> list[dict[str, Any]]:
         """All complete lines so far; raises `ConfigError` in one line that says which is none of ours."""
@@ -53,10 +67,25 @@ class JsonLines:
         """Drop what was written after `env_steps`, for a run that goes on from there."""
         if self._muted or not self.path.exists():
             return
-        rows = [row for row in self.read() if row["env_steps"] <= env_steps]
-        partial = self.path.with_suffix(".partial")
-        partial.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
-        os.replace(partial, self.path)
+        self._replace([row for row in self.read() if row["env_steps"] <= env_steps])
+
+    def mend(self) -> None:
+        """Drop the last line if it is incomplete, as of a process that was killed."""
+        if not self._muted and self.path.exists():
+            self._replace(self.read())
+
+    def _replace(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        try:
+            with files.whole(self.path) as path:
+                path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
+        except EnvError as error:
+            raise ConfigError(str(error)) from None
+
+    def sync(self) -> None:
+        """Have all lines survive a loss of power."""
+        if not self._muted:
+            with contextlib.suppress(FileNotFoundError):
+                files.sync(self.path)
 
 
 @dataclass(frozen=True)
@@ -78,6 +107,18 @@ class Journal:
         """That of a run directory; `muted` as in `JsonLines`."""
         names = ("metrics", "regions", "provenance", "faults")
         return cls(*(JsonLines(run_dir / f"{name}.jsonl", muted=muted) for name in names))
+
+    def keep_until(self, env_steps: int) -> None:
+        """Drop what was measured after `env_steps`, for a run that goes on from there."""
+        self.metrics.keep_until(env_steps)
+        self.regions.keep_until(env_steps)
+        self.provenance.mend()
+        self.faults.mend()
+
+    def sync(self) -> None:
+        """Have all lines survive a loss of power."""
+        for lines in (self.metrics, self.regions, self.provenance, self.faults):
+            lines.sync()
 
 
 def of_epoch(metrics: dict[str, jax.Array], seeds: list[int]) -> list[dict[str, Any]]:

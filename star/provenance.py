@@ -6,6 +6,7 @@ import os
 import platform
 import subprocess
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,15 @@ def here(*, devices: int = 1) -> dict[str, Any]:
     `device` is the kind of the first one, and how many are used if there are several, `devices`. `commit` is that of
     the checkout which the code lies in, with a + if it was changed; empty where there is none.
     """
+    return {"time": datetime.now(UTC).isoformat(timespec="seconds")} | _process(devices)
+
+
+@cache  # the code that runs is that of the first call, whatever becomes of the checkout
+def _process(devices: int) -> dict[str, Any]:
     device = jax.devices()[0]
     cores = len(os.sched_getaffinity(0))
     kind = device.device_kind if device.platform == "gpu" else f"CPU, {cores} core{'s' * (cores > 1)}"
     return {
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": _commit(),
         "device": f"{devices} x {kind}" if devices > 1 else kind,
         "python": platform.python_version(),

@@ -30,12 +30,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from envs import EnvError, files
-from star import faults, sweep_report, trainer
+from star import faults, sweep_report
 from star import program as programs
 from star.config import Config, ConfigError, Positive
 from star.loading import check_setting, explain, kind, load, parse, read_file
 from star.metrics import mean
 from star.side_by_side import SideBySide
+from star.stopping import interruptible
 from star.study import MEASURED, Holding, Ledger, product, reachable, reason
 
 _WAIT_S = 2.0  # between looks at what other workers do
@@ -280,7 +281,7 @@ def work(
 ) -> bool:
     """Run trials until the study has ended all of them; False if interrupted. `make` builds what trains a batch."""
     display = _Display(console or Console(stderr=True), found.trials, quiet=quiet)
-    with display, trainer.interruptible() as interrupted, ledger.holding() as holding:
+    with display, interruptible() as interrupted, ledger.holding() as holding:
         worker = _Worker(found, ledger, holding, make, display, interrupted)
         try:
             while not interrupted():

@@ -1,5 +1,8 @@
 """A run on a maze small enough to train in a second."""
 
+import shutil
+from pathlib import Path
+
 EPOCH = 4 * 60  # env steps
 
 RUN = {
@@ -12,3 +15,9 @@ RUN = {
     "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
     "trainer": {"num_envs": 4, "total_env_steps": 4 * EPOCH, "eval_every": 2, "eval_episodes": 3},
 }
+
+
+def unpacked(name, folder):
+    """The run in `tests/data/<name>.zip`, in a new folder below `folder`."""
+    shutil.unpack_archive(Path(__file__).parent / "data" / f"{name}.zip", folder / name)
+    return folder / name

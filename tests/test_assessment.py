@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import assessment, cli, episode, loading, rendering, report
+from star import assessment, checkpoint, cli, episode, loading, rendering, report
 from star import program as programs
 from star.assessment import Exam, Target
 from star.checkpoint import Checkpoints, load_state
@@ -162,12 +162,19 @@ def test_what_cannot_be_evaluated_is_told_in_one_line_and_nothing_is_written(run
     assert said.replace("RUN", str(run)) in err and err.count("\n") == 1 and out == "" and not list(tmp_path.iterdir())
 
 
+def renumber(path, number):
+    """Make of a checkpoint one of another format."""
+    about = json.loads((path / "about.json").read_text())
+    (path / "about.json").write_text(json.dumps(about | {"format": number}))
+    (path / "SHA256SUMS").write_text(checkpoint._sums(path))
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (lambda path: (path / "config" / "metadata").write_text('{"format": 99}'), "format 99 is newer than"),
-        (lambda path: (path / "config" / "metadata").write_text("{"), "is damaged"),
-        (lambda path: shutil.rmtree(path / "config"), "is damaged"),
+        (lambda path: renumber(path, 99), "format 99 is newer than"),
+        (lambda path: (path / "about.json").write_text("{"), "is damaged"),
+        (lambda path: (path / "SHA256SUMS").unlink(), "is damaged"),
         (lambda path: shutil.rmtree(path / "state" / "d"), "is damaged"),
     ],
 )

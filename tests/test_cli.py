@@ -111,7 +111,6 @@ def refusal(capsys, folder, arguments):
         pytest.param("train", "either a config file or --resume", id="neither config nor resume"),
         pytest.param("train point.yaml --resume runs/old", "either a config file or --resume", id="both"),
         pytest.param("train --resume runs/new", "runs/new: is not a run directory", id="resume of a non-run"),
-        pytest.param("train --resume runs/old", "no checkpoint to resume from", id="resume without checkpoint"),
         pytest.param("train --resume runs/old --run-dir a", "--run-dir", id="resume elsewhere"),
         pytest.param("evaluate runs/new", "runs/new: is not a run directory", id="evaluate a non-run"),
         pytest.param("evaluate runs/old", "runs/old: holds no checkpoint", id="evaluate without checkpoint"),
@@ -267,9 +266,11 @@ def test_settings_may_stand_anywhere(calls, arguments):
     assert calls[0]["config"].tutor.reward_scale == 2.0
 
 
-def test_an_interrupted_run_says_how_to_go_on(monkeypatch, capsys):
-    monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 500, True, None))
-    assert main("train point.yaml --run-dir new".split()) == 130
+@pytest.mark.parametrize(("terminated", "code"), [(False, 130), (True, 0)])
+def test_an_interrupted_run_says_how_to_go_on(monkeypatch, capsys, terminated, code):
+    stopped = trainer.Result(Path("new"), 500, True, None, terminated)
+    monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: stopped)
+    assert main("train point.yaml --run-dir new".split()) == code
     assert "star train --resume new" in capsys.readouterr().out
 
 

@@ -270,7 +270,7 @@ def test_the_command_says_in_one_line_what_was_lost_and_how_to_go_on(
     tmp_path, monkeypatch, capsys, saved, policy, told
 ):
     fault = faults.Fault(480, {6: {"tutor/params/a": 1, "tutor/params/b": 2, "controller/q": 1}})
-    result = trainer.Result(tmp_path / "run", 480, False, None, fault, saved)
+    result = trainer.Result(tmp_path / "run", 480, False, None, fault=fault, saved=saved)
     monkeypatch.setattr(trainer, "train", lambda *args, **kwargs: result)
     (tmp_path / "config.yaml").write_text("{}")
     flags = [word for key, value in policy.items() for word in (f"--{key}", value)]

@@ -2,6 +2,8 @@ import argparse
 import dataclasses
 import importlib.util
 import json
+import random
+import shutil
 from pathlib import Path
 
 import jax
@@ -14,9 +16,11 @@ import star.state
 from envs.arena import Arena
 from star import loading, reachability, replay
 from star import program as programs
+from star.checkpoint import Checkpoints, Damaged
 from star.commander import Decision
 from star.evaluation import bootstrap
 from star.forward_model import Outcome
+from star.metrics import JsonLines
 from star.reachability import MISSES, REACHES
 from star.spec import Spec
 
@@ -138,7 +142,8 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
             seeds = [int(rest[rest.index("--seed") + 1]) + i for i in range(count)]
             trained.append(seeds)
             row = {"env_steps": 500, "wall_s": 9.0, "env_steps_per_s": 100.0 * count, "eval/success_any": 0.9}
-            (folder / "checkpoints").mkdir(parents=True)
+            folder.mkdir(parents=True)
+            (folder / "config.yaml").touch()
             rows = "".join(json.dumps(row | {"seed": seed}) + "\n" for seed in seeds)
             (folder / "metrics.jsonl").write_text(rows, encoding="utf-8")
             start = {"env_steps": 0, "commit": "abc", "device": "abacus", "python": "3", "versions": {}}
@@ -286,3 +291,30 @@ def test_the_benchmark_of_devices_measures_physics_and_compares_with_one_device(
     two = {"devices": 2, "physics": 200.0, "acting": 90.0, "epoch": 34.0}
     assert script.ratio(two, one) == {"physics": 2.0, "acting": 1.8, "epoch": 1.7}
     assert script.ratio(two, two) is None
+
+
+def test_the_soak_test_damages_a_checkpoint_so_that_it_is_noticed_and_finds_what_differs(run, tmp_path):
+    script, chance = load("soak"), random.Random(0)
+    for kind in script.KINDS:
+        copy = tmp_path / kind
+        shutil.copytree(run, copy)
+        assert script.damage(copy / "checkpoints" / "160", kind, chance)
+        with pytest.raises(Damaged):
+            Checkpoints(copy).check(160)
+    row = {"env_steps": 160, "loss": 0.5}
+    shutil.copytree(run, tmp_path / "run")
+    for wall_s in (1.0, 2.0):
+        JsonLines(tmp_path / "run" / "metrics.jsonl").write(row | {"wall_s": wall_s})
+    one = script.end(tmp_path / "run")
+    assert one["metrics"] == [row, row] and script.differs(one, script.end(tmp_path / "run")) == []
+    other = {**one, "arrays": {**one["arrays"], "epoch": b""}, "metrics": [row]}
+    assert script.differs(one, other) == ["epoch", "metrics"]
+
+
+def test_growth_of_memory_is_that_from_the_first_minute_after_settling_to_the_last():
+    growth = load("soak").growth
+    samples = [{"s": s, "host_mib": 100.0 + min(s, 300) + (s > 600) * 3, "device_mib": 7.0} for s in range(0, 901, 5)]
+    found = growth(samples, settle_s=300)
+    assert found["host_mib"] == {"before": 400.0, "after": 403.0, "growth": 3.0}
+    assert found["device_mib"]["growth"] == 0
+    assert growth(samples, settle_s=1000) == {} == growth([], settle_s=0)

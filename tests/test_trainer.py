@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -21,15 +22,17 @@ import pytest
 import yaml
 
 import envs
-from star import cli, provenance, report, trainer
+from star import checkpoint, cli, provenance, report, starting, stopping, trainer
 from star import program as programs
 from star.checkpoint import Checkpoints, check_compatible
 from star.config import ConfigError
 from star.loading import load, parse
+from star.lock import locked
 from star.metrics import Journal, JsonLines
+from star.migrations import FORMAT
 from star.sgim import teachers
 from star.side_by_side import SideBySide
-from tests.small import EPOCH, RUN
+from tests.small import EPOCH, RUN, unpacked
 
 ROOT = Path(__file__).parents[1]
 TIMES = ("wall_s", "env_steps_per_s")
@@ -90,7 +93,7 @@ def test_a_run_leaves_config_metrics_checkpoints_and_figure(finished):
     run_dir, result = finished
     assert result.env_steps == 4 * EPOCH and not result.interrupted
     assert {entry.name.split(".out.")[0] for entry in run_dir.iterdir()} == {
-        "config.yaml", "metrics.jsonl", "regions.jsonl", "provenance.jsonl", "checkpoints", "figures",
+        "config.yaml", "metrics.jsonl", "regions.jsonl", "provenance.jsonl", "checkpoints", "figures", ".lock",
         "events", "seed_0", "seed_1",
     }  # fmt: skip
     for name in ("summary", "growth", "sgim"):
@@ -182,6 +185,115 @@ def test_an_interrupted_run_resumes_to_the_same_final_state_bit_for_bit(finished
     assert rows(part) == rows(run_dir)
     assert Journal.of(part).regions.read() == Journal.of(run_dir).regions.read()
     assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+
+
+def test_sigterm_ends_a_run_like_ctrl_c_but_for_the_exit_code(tmp_path, monkeypatch):
+    interrupt_after(monkeypatch, epochs=1, number=signal.SIGTERM)
+    result = trainer.train(tiny(), tmp_path / "run", quiet=True)
+    assert result.interrupted and result.terminated and result.env_steps == EPOCH
+    assert Checkpoints(tmp_path / "run").steps() == [EPOCH]
+
+
+def test_an_epoch_too_long_for_sigterm_is_given_up_and_the_one_before_it_saved(finished, tmp_path, monkeypatch):
+    run_dir, _ = finished
+    part, over = tmp_path / "part", threading.Event()
+    with monkeypatch.context() as patch:
+        patch.setattr(stopping, "GRACE_S", 0.0)
+        patch.setattr(trainer, "_LONG_S", 0.0)
+        interrupt_after(patch, epochs=4, number=signal.SIGTERM, then=over.wait)
+        result = trainer.train(tiny(), part, quiet=True)
+        over.set()
+        for thread in stopping.computing():
+            thread.join()
+    assert result.terminated and result.env_steps == 3 * EPOCH
+    assert Checkpoints(part).steps() == [2 * EPOCH, 3 * EPOCH]
+    trainer.train(load(part / "config.yaml"), part, resume=True, quiet=True)
+    assert rows(part) == rows(run_dir)
+    assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+
+
+def test_a_damaged_newest_checkpoint_is_set_aside_and_the_run_goes_on_from_the_one_before(finished, tmp_path, capsys):
+    run_dir, _ = finished
+    part = tmp_path / "part"
+    shutil.copytree(run_dir, part)
+    (part / "checkpoints" / str(4 * EPOCH) / "state" / "_METADATA").write_text("")
+    assert cli.main(["evaluate", str(part), "--episodes", "5", "--json", "--quiet"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["env_steps"] == 2 * EPOCH
+    assert f"{4 * EPOCH}: is damaged: state/_METADATA differs" in err and err.count("\n") == 1
+    trainer.train(tiny(), part, resume=True, quiet=True)
+    err = capsys.readouterr().err
+    assert f"it is now {4 * EPOCH}.damaged, and the run goes on from {2 * EPOCH} env steps" in err
+    assert err.count("\n") == 1
+    assert Journal.of(part).provenance.read()[-1]["env_steps"] == 2 * EPOCH
+    assert {entry.name for entry in (part / "checkpoints").iterdir()} == {str(2 * EPOCH), str(4 * EPOCH)}
+    assert rows(part) == rows(run_dir)
+    assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+
+
+def test_a_run_killed_before_its_first_checkpoint_begins_anew(finished, tmp_path, capsys):
+    run_dir, _ = finished
+    part = tmp_path / "part"
+    shutil.copytree(run_dir, part)
+    shutil.rmtree(part / "checkpoints")
+    os.truncate(part / "metrics.jsonl", (part / "metrics.jsonl").stat().st_size // 2)
+    with (part / "provenance.jsonl").open("a") as file:
+        file.write('{"env_steps": 0, "half a li')
+    with pytest.raises(ConfigError, match="part: was begun with trainer.num_envs 4, not 8"):
+        trainer.train(tiny(trainer__num_envs=8), part, resume=True, quiet=True)
+    trainer.train(load(part / "config.yaml"), part, resume=True, quiet=True)
+    assert capsys.readouterr().err == f"warning: {part}: holds no checkpoint, so it begins anew\n"
+    assert rows(part) == rows(run_dir)
+    assert Journal.of(part).regions.read() == Journal.of(run_dir).regions.read()
+    assert len(Journal.of(part).provenance.read()) == 2
+    assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+
+
+def test_what_a_run_killed_at_once_left_does_not_keep_another_from_beginning(tmp_path):
+    for name in (".lock", ".config-abc/config.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    starting.make(tmp_path)
+    (tmp_path / "config.yaml").touch()
+    with pytest.raises(ConfigError, match="is not empty"):
+        starting.make(tmp_path)
+
+
+def test_a_second_process_is_refused_and_changes_nothing(finished):
+    run_dir, _ = finished
+    before = {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()}
+    with locked(run_dir, warn=print):
+        held = (run_dir / ".lock").read_bytes()
+        with pytest.raises(ConfigError, match="is in use by process"):
+            trainer.train(tiny(), run_dir, resume=True, quiet=True)
+    assert {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()} == before | {
+        run_dir / ".lock": held
+    }
+
+
+def test_a_disk_that_fills_up_ends_the_run_in_one_line_and_it_resumes(finished, tmp_path, monkeypatch, capsys):
+    run_dir, _ = finished
+    part = tmp_path / "part"
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "_sums", fail_after(checkpoint._sums, 1, OSError(28, "No space left on device")))
+        with pytest.raises(ConfigError, match=f"{4 * EPOCH}: cannot be written: No space left on device; earlier"):
+            trainer.train(tiny(), part, quiet=True)
+    assert Checkpoints(part).steps() == [2 * EPOCH] and rows(part) == rows(run_dir)
+    trainer.train(tiny(), part, resume=True, quiet=True)
+    assert rows(part) == rows(run_dir)
+    assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+
+
+def test_a_run_of_an_older_format_goes_on_from_its_checkpoint(tmp_path, capsys):
+    run_dir = unpacked("format_2", tmp_path)
+    before = rows(run_dir)
+    result = trainer.train(tiny(), run_dir, resume=True, quiet=True)
+    assert result.env_steps == 4 * EPOCH and capsys.readouterr().err == ""
+    assert rows(run_dir)[: len(before)] == before and len(rows(run_dir)) == 2 * len(before) == 8
+    assert np.isfinite([row["controller/critic_loss"] for row in rows(run_dir)]).all()
+    about = json.loads((run_dir / "checkpoints" / str(4 * EPOCH) / "about.json").read_text())
+    assert about["format"] == FORMAT
+    saved_state(tiny(), run_dir)
 
 
 def test_what_sgim_has_chosen_is_written_down(finished):
@@ -420,8 +532,21 @@ def test_runs_side_by_side_are_each_what_train_makes_of_them(finished, tmp_path)
                 assert value == pytest.approx(expected[key], rel=2e-3, abs=1e-4), (key, row["env_steps"])
 
 
-def interrupt_after(monkeypatch, *, epochs):
-    """Press Ctrl-C during epoch number `epochs`."""
+def fail_after(function, times, error):
+    """`function`, which raises `error` after so many calls."""
+    calls = []
+
+    def failing(*arguments):
+        calls.append(None)
+        if len(calls) > times:
+            raise error
+        return function(*arguments)
+
+    return failing
+
+
+def interrupt_after(monkeypatch, *, epochs, number=signal.SIGINT, then=lambda: None):
+    """Press Ctrl-C, or send another signal, during epoch number `epochs`, and do `then` before the epoch itself."""
     build = programs.build
 
     def pressing(config):
@@ -431,7 +556,8 @@ def interrupt_after(monkeypatch, *, epochs):
         def epoch(*arguments):
             calls.append(None)
             if len(calls) == epochs:
-                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(number)
+                then()
             return program.functions.epoch(*arguments)
 
         return dataclasses.replace(program, functions=dataclasses.replace(program.functions, epoch=epoch))
@@ -445,4 +571,5 @@ def assert_equal(one, other):
 
 def test_a_checkout_that_is_not_installed_says_where_it_runs_all_the_same(monkeypatch):
     monkeypatch.setattr(provenance, "_PACKAGES", ("jax", "no-such-package"))
+    monkeypatch.setattr(provenance, "_process", provenance._process.__wrapped__)
     assert provenance.here()["versions"] == {"jax": jax.__version__, "no-such-package": None}

@@ -1,0 +1,43 @@
+"""One process at a time writes into a run directory."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import platform
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from star.config import ConfigError
+
+NAME = ".lock"
+
+
+@contextlib.contextmanager
+def locked(run_dir: Path, *, warn: Callable[[str], None]) -> Iterator[None]:
+    """Hold `run_dir` alone; raises `ConfigError` if another process does, or if the folder cannot be written.
+
+    The system releases the lock when the process ends, however it does; the file stays. Where the file system cannot
+    lock, that is said, and nothing is held.
+    """
+    path = run_dir / NAME
+    try:
+        file = path.open("a+", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{run_dir}: cannot be written: {error.strerror}") from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.read(200).strip() or "another process"
+            raise ConfigError(f"{run_dir}: is in use by {holder}; wait for its end, or stop it") from None
+        except OSError as error:
+            warn(f"{run_dir}: its file system cannot lock ({error.strerror}); see that no other process trains in it")
+        else:
+            with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
+                file.truncate(0)
+                file.write(f"process {os.getpid()} on {platform.node()}")
+                file.flush()
+        yield

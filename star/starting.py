@@ -1,0 +1,65 @@
+"""How a run begins, or goes on: its folder and its first state. Of several processes the first one writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from envs import EnvError, files
+from star import checkpoint, devices, lock
+from star.checkpoint import Checkpoints
+from star.config import Config, ConfigError
+from star.loading import load
+from star.metrics import Journal
+from star.program import Program
+from star.state import TrainState
+
+_BEGUN = (lock.NAME, ".config-")  # of a run that was killed before its config.yaml was written
+
+
+def make(run_dir: Path) -> None:
+    """Make the folder of a new run; what a process that was killed at once left there does no harm."""
+    used = run_dir.is_dir() and any(not entry.name.startswith(_BEGUN) for entry in run_dir.iterdir())
+    if used or (run_dir.exists() and not run_dir.is_dir()):
+        raise ConfigError(
+            f"{run_dir}: is not empty; choose another --run-dir, or go on with it: star train --resume {run_dir}"
+        )
+    devices.wait("the run directory is empty")
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{run_dir}: cannot be written: {error.strerror}") from None
+
+
+def note(run_dir: Path, config: Config) -> None:
+    """Write the config of a new run into its folder."""
+    if not devices.first():
+        return
+    try:
+        with files.whole(run_dir / "config.yaml") as path:
+            path.write_text(config.to_yaml(), encoding="utf-8")
+    except EnvError as error:
+        raise ConfigError(str(error)) from None
+
+
+def restored(
+    program: Program, checkpoints: Checkpoints, journal: Journal, *, warn: Callable[[str], None]
+) -> TrainState:
+    """The state to go on from, after what was measured later has been dropped. A damaged checkpoint is set aside."""
+    run_dir = journal.metrics.path.parent
+    if not checkpoints.steps():
+        for key, old, new in checkpoint.differences(load(run_dir / "config.yaml"), program.config):
+            raise ConfigError(f"{run_dir}: was begun with {key} {old}, not {new}")
+        warn(f"{run_dir}: holds no checkpoint, so it begins anew")
+        journal.keep_until(0)
+        devices.wait("the journal is empty")
+        return program.init(program.seed_keys())
+    step, damaged = checkpoint.newest(checkpoints)
+    state = checkpoint.restore(program, checkpoints, step, source=run_dir)
+    devices.wait("all processes have their state")
+    for number, error in damaged.items():
+        aside = checkpoints.set_aside(number)
+        warn(f"{error}; it is now {aside.name}, and the run goes on from {step:,} env steps")
+    journal.keep_until(step)
+    devices.wait("the journal is that of the checkpoint")
+    return state

@@ -1,0 +1,38 @@
+import errno
+import fcntl
+import os
+
+import pytest
+
+from star.config import ConfigError
+from star.lock import locked
+
+
+def unexpected(line):
+    raise AssertionError(line)
+
+
+def test_a_run_directory_in_use_is_refused_with_the_name_of_who_uses_it(tmp_path):
+    with locked(tmp_path, warn=unexpected):
+        with pytest.raises(ConfigError, match=f"^{tmp_path}: is in use by process {os.getpid()} on "):
+            with locked(tmp_path, warn=unexpected):
+                raise AssertionError
+    with locked(tmp_path, warn=unexpected):
+        pass
+
+
+def test_a_file_system_that_cannot_lock_is_told_of_and_used_all_the_same(tmp_path, monkeypatch):
+    def cannot(file, how):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", cannot)
+    told = []
+    with locked(tmp_path, warn=told.append):
+        pass
+    assert len(told) == 1 and "cannot lock (No locks available)" in told[0]
+
+
+def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):
+    with pytest.raises(ConfigError, match="none: cannot be written: No such file or directory"):
+        with locked(tmp_path / "none", warn=unexpected):
+            raise AssertionError

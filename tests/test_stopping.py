@@ -1,0 +1,66 @@
+import os
+import signal
+import threading
+
+import pytest
+
+from star import stopping
+from star.stopping import Overdue, interruptible
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_asks_and_the_second_stops_at_once(number):
+    told = []
+    before = signal.getsignal(number)
+    with interruptible(lambda: told.append(1)) as stop:
+        assert not stop()
+        signal.raise_signal(number)
+        assert stop() and stop.terminated == (number == signal.SIGTERM) and told == [1]
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+    assert signal.getsignal(number) is before
+
+
+def test_what_is_computed_is_returned_and_its_errors_are_raised():
+    with interruptible() as stop:
+        assert stop.during(lambda: 7) == 7
+        with pytest.raises(ZeroDivisionError):
+            stop.during(lambda: 1 / 0)
+    assert stopping.leave(3) == 3
+
+
+@pytest.fixture
+def endless():
+    """Something that computes until the test is over."""
+    over = threading.Event()
+    yield over.wait
+    over.set()
+    for thread in stopping.computing():
+        thread.join()
+
+
+@pytest.mark.parametrize(("signals", "raised"), [([signal.SIGTERM], Overdue), ([signal.SIGINT] * 2, KeyboardInterrupt)])
+def test_a_long_computation_is_abandoned_and_the_process_leaves_it(monkeypatch, endless, signals, raised):
+    monkeypatch.setattr(stopping, "GRACE_S", 0.0)
+    left = []
+    monkeypatch.setattr(os, "_exit", left.append)
+    with interruptible() as stop:
+
+        def compute():
+            for number in signals:
+                os.kill(os.getpid(), number)
+                while not stop():
+                    pass
+            endless()
+
+        with pytest.raises(raised):
+            stop.during(compute)
+    stopping.leave(5)
+    assert left == [5]
+
+
+def test_ctrl_c_waits_for_what_is_computed(monkeypatch):
+    monkeypatch.setattr(stopping, "GRACE_S", 0.0)
+    with interruptible() as stop:
+        assert stop.during(lambda: signal.raise_signal(signal.SIGINT) or 7) == 7
+        assert stop()
