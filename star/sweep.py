@@ -37,7 +37,7 @@ from star.config import Config, ConfigError, Positive
 from star.loading import check_setting, explain, kind, load, parse, read_file
 from star.metrics import mean
 from star.side_by_side import SideBySide
-from star.study import MEASURED, Holding, Ledger, product, reachable, reason
+from star.study import MEASURED, Cmaes, Holding, Ledger, product, reachable, reason
 
 _WAIT_S = 2.0  # between looks at what other workers do
 _MEASURES = ("success_any", "success_final")
@@ -509,7 +509,7 @@ def _sampler(file: Sweep, seed: int) -> samplers.BaseSampler:
     if file.sampler == "tpe":
         return samplers.TPESampler(seed=seed)
     if file.sampler == "cmaes":
-        return samplers.CmaEsSampler(seed=seed)
+        return Cmaes(seed=seed)
     return samplers.RandomSampler(seed=seed)  # a grid draws nothing
 
 

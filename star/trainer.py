@@ -14,7 +14,7 @@ from typing import Any
 import jax
 from rich.console import Console
 
-from star import checkpoint, evaluation, profiling, provenance, report, sinks
+from star import checkpoint, evaluation, memory, profiling, provenance, report, sinks
 from star import program as programs
 from star.checkpoint import Checkpoints
 from star.config import Config, ConfigError
@@ -53,6 +53,7 @@ def train(
     sinks.check(config)
     program = programs.build(config)
     program.lessons()  # refused before anything is written
+    memory.check(program)
     checkpoints = Checkpoints(run_dir, keep=config.trainer.keep_checkpoints)
     traced = _traced(program, checkpoints, profile) if profile else 0
     journal = Journal.of(run_dir)
@@ -216,11 +217,11 @@ def _restore(program: Program, checkpoints: Checkpoints, journal: Journal) -> Tr
 
 
 def _prepare(run_dir: Path, config: Config) -> None:
-    if run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
-        raise ConfigError(
-            f"{run_dir}: is not empty; choose another --run-dir, or go on with it: star train --resume {run_dir}"
-        )
     try:
+        if run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
+            raise ConfigError(
+                f"{run_dir}: is not empty; choose another --run-dir, or go on with it: star train --resume {run_dir}"
+            )
         run_dir.mkdir(parents=True, exist_ok=True)
         (run_dir / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
     except OSError as error:
