@@ -265,7 +265,7 @@ def test_odd_configs_are_accepted_or_refused_in_one_line_and_leave_nothing_behin
         (lambda: print("error: a\nb", file=sys.stderr) or 2, "not one line"),
         (lambda: print("error: a", file=sys.stderr) or Path("left").write_text("") or 2, "file left behind"),
         (lambda: 1 / 0, "traceback"),
-        (lambda: 0, "file left behind"),
+        (lambda: 0, "no run, or more"),
         (lambda: time.sleep(5), "hang"),
         (lambda: print("error: a", file=sys.stderr) or 2, "refused"),
     ],

@@ -288,6 +288,11 @@ def test_every_shipped_sweep_is_valid_and_trains_side_by_side(path):
         ({"parameters": {"tutor.enabled": {"low": 0, "high": 1}}, "sampler": "tpe"}, "tutor.enabled"),
         ({"parameters": {"env.options.mapp": ["a"]}}, "mapp"),
         ({"sampler": "cmaes"}, "cmaes needs two or more"),
+        ({"parameters": {"tutor.ppo.passes": {"low": 10**400, "high": 1}}}, "is above high 1"),
+        (
+            {"parameters": {f"refinement.{key}": {"low": 1, "high": 500} for key in ("min_visits", "min_transitions")}},
+            "a grid of more than 100,000 points",
+        ),
         ({"sampler": "best"}, "sampler: 'best' is not allowed"),
         ({"sampla": "grid"}, "sampla: unknown key (did you mean sampler?)"),
         ({"config": "no.yaml"}, "no.yaml: no such file"),
