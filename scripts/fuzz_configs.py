@@ -527,6 +527,9 @@ def main() -> int:
         if found["seed"] != options.seed:
             parser.error(f"{options.out} is of seed {found['seed']}")
 
+    about = {k: v for k, v in provenance.here().items() if k in ("time", "commit", "device", "versions")}
+    about["command"] = shlex.join(["python", "scripts/fuzz_configs.py", *sys.argv[1:]])
+
     def tell(case: Case, trial: Trial) -> None:
         found["configs"] += 1
         found["ended"][trial.ended] = found["ended"].get(trial.ended, 0) + 1
@@ -534,10 +537,10 @@ def main() -> int:
         of[trial.ended] = of.get(trial.ended, 0) + 1
         found["slowest_s"][trial.ended] = round(max(found["slowest_s"].get(trial.ended, 0.0), trial.seconds), 1)
         if trial.ended not in ("trained", "built", "refused", "helped"):
-            about = {"ended": trial.ended, "kind": case.kind, "arguments": case.arguments, "said": trial.line[-3000:]}
-            about |= {"files": {name: repr(data[:3000]) for name, data in case.files.items()}}
-            found["failures"].append(about)
-            print(json.dumps(about), file=sys.stderr, flush=True)
+            failure = {"ended": trial.ended, "said": trial.line[-3000:], "kind": case.kind, "arguments": case.arguments}
+            failure |= {"files": {name: repr(data[:3000]) for name, data in case.files.items()}}
+            found["failures"].append(failure)
+            print(json.dumps(failure), file=sys.stderr, flush=True)
 
     while found["configs"] < options.configs:
         began = time.monotonic()
@@ -545,8 +548,7 @@ def main() -> int:
         found["chunks"] += 1  # of which hypothesis may have made fewer configs than it could
         found["wall_s"] = round(found["wall_s"] + time.monotonic() - began, 1)
         found["structures"] = max(found.get("structures", 0), len(shared.known))
-        found["command"] = shlex.join(["python", "scripts/fuzz_configs.py", *sys.argv[1:]])
-        found |= {k: v for k, v in provenance.here().items() if k in ("time", "commit", "device", "versions")}
+        found |= about
         options.out.parent.mkdir(parents=True, exist_ok=True)
         partial = options.out.with_suffix(".partial")
         partial.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

@@ -47,10 +47,15 @@ def available() -> int:
 def _passing(program: Program) -> dict[str, int]:
     """Bytes of rollouts, and of what networks keep of a batch to learn from it."""
     config, seeds = program.config, len(program.seeds)
-    model = config.forward_model
-    found = {"forward_model": seeds * _activations(model.batch_size, model.hidden)}
-    if config.tutor.adjacency.enabled:
-        near = config.tutor.adjacency
+    tutor, model, near = config.tutor, config.forward_model, config.tutor.adjacency
+    found = {}
+    if config.commander.enabled:
+        found["forward_model"] = seeds * _activations(model.batch_size, model.hidden)
+    if tutor.off_policy_correction:  # the Controller's policy for each candidate
+        hidden = getattr(config.controller, config.controller.learner).hidden
+        rows = tutor.correction_candidates * tutor.td3.batch_size * tutor.period
+        found["tutor.correction_candidates"] = seeds * _activations(rows, hidden[:1])
+    if near.enabled:
         found["tutor.adjacency"] = seeds * _activations(near.batch_size, (*near.hidden, near.features))
     examples = dict(zip(("tutor", "controller"), states.examples(config.agent(), program.spec), strict=True))
     for name, level, decisions in config.learners():
