@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from envs.options import EnvError
+from envs import reading
+from envs.options import EnvError, shown
 
 WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE = "10rg#BD"
 SYMBOLS = (WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE)
@@ -147,7 +148,7 @@ def read(source: str, *, cell: float) -> Arena:
       EnvError: in one line that names the file, and the row and column counted from 1.
     """
     source = source.strip()
-    name, text = "map" if "\n" in source else f"map {source}", load(source)
+    name, text = "map" if "\n" in source else f"map {_short(source)}", load(source)
     return check(
         _from_yaml(text, cell, name=name) if re.search(r"^\s*\w+\s*:", text, re.M) else Arena(_rows(text), cell),
         name=name,
@@ -159,11 +160,15 @@ def load(source: str) -> str:
     if "\n" in source.strip():
         return source
     try:
-        return Path(source).read_text(encoding="utf-8")
+        return reading.text(Path(source))
     except OSError as error:
-        raise EnvError(f"map {source}: cannot be read: {error.strerror}") from None
+        raise EnvError(f"map {_short(source)}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise EnvError(f"map {source}: is not a text file") from None
+        raise EnvError(f"map {_short(source)}: is not a text file") from None
+
+
+def _short(path: str) -> str:
+    return path if len(path) <= 200 else f"{path[:197]}..."
 
 
 def _rows(text: str) -> tuple[str, ...]:
@@ -172,8 +177,8 @@ def _rows(text: str) -> tuple[str, ...]:
 
 def _from_yaml(text: str, cell: float, *, name: str) -> Arena:
     try:
-        values = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        values = reading.plain(text)
+    except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         raise EnvError(f"{name}: is not YAML" + (f", line {mark.line + 1}" if mark else "")) from None
     if not isinstance(values, dict) or not isinstance(values.get("map"), str):
@@ -181,11 +186,11 @@ def _from_yaml(text: str, cell: float, *, name: str) -> Arena:
     given: dict[Any, Any] = {"cell": cell, "block": "xy"} | values
     for key in given:
         if key not in ("map", "cell", "block"):
-            raise EnvError(f'{name}: key "{key}" is unknown; allowed: map, cell, block')
+            raise EnvError(f'{name}: key "{_short(str(key))}" is unknown; allowed: map, cell, block')
     if type(given["cell"]) not in (int, float) or not CELL_SIZES[0] <= given["cell"] <= CELL_SIZES[1]:
-        raise EnvError(f"{name}: cell is {given['cell']!r}; allowed: {CELL_SIZES[0]} to {CELL_SIZES[1]} m")
+        raise EnvError(f"{name}: cell is {shown(given['cell'])}; allowed: {CELL_SIZES[0]} to {CELL_SIZES[1]} m")
     if given["block"] not in BLOCK_AXES:
-        raise EnvError(f"{name}: block is {given['block']!r}; allowed: {', '.join(BLOCK_AXES)}")
+        raise EnvError(f"{name}: block is {shown(given['block'])}; allowed: {', '.join(BLOCK_AXES)}")
     return Arena(_rows(values["map"]), float(given["cell"]), given["block"])
 
 

@@ -13,8 +13,11 @@ from envs.options import EnvError
 
 def check(path: Path, endings: Sequence[str], *, force: bool = False) -> None:
     """Raise `EnvError` in one line if `path` cannot be written, or would be replaced without `force`."""
-    if path.is_dir():
-        raise EnvError(f"{path}: is a folder")
+    try:
+        if path.is_dir():
+            raise EnvError(f"{path}: is a folder")
+    except OSError as error:  # such as a name too long
+        raise EnvError(f"{path}: cannot be written: {error.strerror}") from None
     if path.suffix.lower() not in endings:
         raise EnvError(f"{path}: cannot tell what to write; allowed endings: {', '.join(endings)}")
     if not path.parent.is_dir():

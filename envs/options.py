@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -27,17 +28,17 @@ def choice(default: str, *others: str) -> Option:
     return Option(default, lambda value: isinstance(value, str) and value in words, ", ".join(words))
 
 
-def count(default: int | None) -> Option:
-    """A positive whole number."""
-    return Option(default, lambda value: type(value) is int and value > 0, "a whole number above 0")
+def count(default: int | None, most: int) -> Option:
+    """A whole number from 1 to `most`."""
+    return Option(default, lambda value: type(value) is int and 1 <= value <= most, f"a whole number from 1 to {most}")
 
 
-def duration(default: float | None) -> Option:
-    """A positive, finite number of seconds."""
+def duration(default: float | None, most: float) -> Option:
+    """A positive number of seconds up to `most`."""
     return Option(
         default,
-        lambda value: type(value) in (int, float) and 0 < value < float("inf"),
-        "a number of seconds above 0",
+        lambda value: type(value) in (int, float) and 0 < value <= most,
+        f"a number of seconds above 0, up to {most:g}",
     )
 
 
@@ -55,9 +56,9 @@ def resolve(task: str, options: Mapping[str, Option], given: Mapping[str, Any]) 
     """
     for key, value in given.items():
         if key not in options:
-            raise EnvError(f'option "{key}" ({value!r}) is not one of {task}: {known(key, options)}')
+            raise EnvError(f'option "{key[:60]}" ({shown(value)}) is not one of {task}: {known(key, options)}')
         if not options[key].accepts(value):
-            raise EnvError(f'option "{key}" of {task} is {value!r}; allowed: {options[key].allowed}')
+            raise EnvError(f'option "{key}" of {task} is {shown(value)}; allowed: {options[key].allowed}')
     return {key: given.get(key, option.default) for key, option in options.items()}
 
 
@@ -66,3 +67,12 @@ def known(word: str, words: Iterable[str]) -> str:
     words = tuple(words)
     nearest = difflib.get_close_matches(str(word), words, n=1)
     return "allowed: " + ", ".join(words) + (f'; did you mean "{nearest[0]}"?' if nearest else "")
+
+
+def shown(value: Any, limit: int = 60) -> str:
+    """A value that a user gave, on one line and cut short."""
+    try:
+        text = "nan" if isinstance(value, float) and math.isnan(value) else repr(value)
+    except ValueError:  # Python does not write whole numbers of thousands of digits
+        text = "a number of thousands of digits"
+    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -155,7 +155,7 @@ def _scaled(point: Point, ratio: float) -> Point:
 MAP = Option(None, lambda value: isinstance(value, str) and bool(value), "the path of a map, or its rows")
 
 COMMON: Mapping[str, Option] = {
-    "episode_length": count(500),
+    "episode_length": count(500, 100_000),
     "observe": choice("published", "full"),
     "reward": choice("distance", "sparse"),
     "success_radius": number(None, 0.01, 100.0, "m"),
@@ -168,13 +168,13 @@ ANT: Mapping[str, Option] = {
     "flip": choice("ignore", "terminate", "truncate"),
     "preset": choice(*PRESETS),
     "collisions": choice("all", "feet"),
-    "timestep": duration(0.02),
-    "frames": count(5),
+    "timestep": duration(0.02, 1.0),
+    "frames": count(5, 1000),
     "solver": choice(*SOLVERS),
     "cone": choice(*CONES),
     "integrator": replace(choice(*INTEGRATORS), default=None),  # None: that of the preset
-    "iterations": count(None),
-    "ls_iterations": count(None),
+    "iterations": count(None, 10_000),
+    "ls_iterations": count(None, 10_000),
 }
 
 

@@ -11,6 +11,7 @@ Source: the set-based abstraction N of Zadem, Mover and Nguyen, ICLR 2024, secti
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
@@ -61,9 +62,13 @@ def create(space: tuple[ArrayLike, ArrayLike], cuts: Sequence[Sequence[float]], 
     low, high = (np.asarray(corner, np.float32) for corner in space)
     if len(cuts) != len(low):
         raise ValueError(f"{len(cuts)} lists of cuts for {len(low)} abstract dimensions")
+    count = math.prod(len(positions) + 1 for positions in cuts)
+    if count > max_regions:
+        raise ValueError(f"{count} initial regions exceed abstraction.max_regions {max_regions}")
     intervals = []
     for dimension, positions in enumerate(cuts):
-        edges = np.asarray([low[dimension], *positions, high[dimension]], np.float32)
+        with np.errstate(over="ignore"):  # what is too large becomes infinite, which is outside of the space
+            edges = np.asarray([low[dimension], *positions, high[dimension]], np.float32)
         if not np.all(np.diff(edges) > 0):
             raise ValueError(
                 f"{list(positions)} do not increase between {low[dimension]:g} and {high[dimension]:g} "
@@ -71,10 +76,7 @@ def create(space: tuple[ArrayLike, ArrayLike], cuts: Sequence[Sequence[float]], 
             )
         intervals.append(list(itertools.pairwise(edges)))
     boxes = np.asarray(list(itertools.product(*intervals)), np.float32)
-    count, d = boxes.shape[:2]
-    if count > max_regions:
-        raise ValueError(f"{count} initial regions exceed abstraction.max_regions {max_regions}")
-    lower, upper = np.zeros((2, max_regions, d), np.float32)
+    lower, upper = np.zeros((2, max_regions, len(low)), np.float32)
     lower[:count], upper[:count] = boxes[..., 0], boxes[..., 1]
     return Abstraction(
         lower=jnp.asarray(lower),

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import yaml
 from rich.console import Console
 
+from envs import reading
 from star.config import Config, ConfigError, TrainerConfig
-from star.loading import fields, load, parse, read_yaml
+from star.loading import fields, load, parse
 from star.stopping import leave
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ does, as demonstrations for other agents: routes, states and actions."""
 _REPORT = """\
 One page with the curves of the runs over each other, how their regions grew, what they are worth to the Commander,
 the settings in which the runs differ, and films. It needs no network. A run may still be going on."""
+_LONGEST_ERROR = 1000  # characters
 _MOST_PROFILED = 20  # epochs; a trace takes tens of MB for each
 _SWEEP = """\
 Train with many settings that Optuna chooses, side by side where it can be done, and write down which are best.
@@ -76,11 +78,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         code = _run(sys.argv[1:] if arguments is None else list(arguments))
     except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {_on_one_line(str(error))}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         code = 130
     return leave(code)
+
+
+def _on_one_line(message: str) -> str:
+    """Keys and names may hold anything: what a terminal would not print as it is, is written out."""
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message[:_LONGEST_ERROR])
+    return shown + "..." * (len(message) > _LONGEST_ERROR)
 
 
 def _run(arguments: list[str]) -> int:
@@ -257,8 +265,8 @@ def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]
 def _value(text: str) -> Any:
     """Numbers, lists and the like as YAML reads them; text that YAML does not read stays text."""
     try:
-        return read_yaml(text)
-    except (yaml.YAMLError, ValueError, RecursionError):
+        return reading.plain(text)
+    except yaml.YAMLError:
         return text
 
 
@@ -584,10 +592,13 @@ def _agent_config(run_dir: Path, overrides: dict[str, Any]) -> Config:
 
 def _run_config(run_dir: Path, overrides: dict[str, Any]) -> Config:
     path = run_dir / "config.yaml"
-    if not run_dir.exists():
-        raise ConfigError(f"{run_dir}: is not a run directory, there is nothing of this name")
-    if not path.is_file():
-        raise ConfigError(f"{run_dir}: is not a run directory, it holds no config.yaml")
+    try:
+        if not run_dir.exists():
+            raise ConfigError(f"{run_dir}: is not a run directory, there is nothing of this name")
+        if not path.is_file():
+            raise ConfigError(f"{run_dir}: is not a run directory, it holds no config.yaml")
+    except OSError as error:
+        raise ConfigError(f"{run_dir}: cannot be read: {error.strerror}") from None
     return load(path, overrides)
 
 

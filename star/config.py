@@ -54,8 +54,12 @@ def _unflatten(cls: type[Section], static: tuple[Any, ...], leaves: Iterable[Any
     return cls.model_construct(**dict(zip(names, leaves, strict=True)), **dict(static))
 
 
-Positive = Annotated[int, Field(gt=0)]
-Count = Annotated[int, Field(ge=0)]
+# Upper bounds are far above what is of use. They keep whole numbers within those of a device, loops and the
+# programs that are compiled of them finite, and what is allocated within what `star.memory` can add up.
+Positive = Annotated[int, Field(gt=0, lt=2**31)]
+Batch = Annotated[int, Field(gt=0, le=2**20)]
+Repeats = Annotated[int, Field(gt=0, le=100_000)]
+Hidden = Annotated[tuple[Annotated[int, Field(gt=0, le=2**14)], ...], Field(max_length=16)]
 
 
 class EnvConfig(Section):
@@ -70,7 +74,7 @@ class EnvConfig(Section):
 class PPOConfig(Section):
     """Proximal policy optimisation (Schulman et al. 2017) with an adaptive learning rate."""
 
-    hidden: tuple[Positive, ...] = Field((256, 256, 128), description="widths of the actor's and critic's layers")
+    hidden: Hidden = Field((256, 256, 128), description="widths of the actor's and critic's layers")
     learning_rate: float = Field(5e-4, gt=0, description="initial Adam step size")
     max_learning_rate: float = Field(1e-3, gt=0, description="ceiling of the adaptive step size")
     target_kl: float = Field(0.016, gt=0, description="KL divergence per pass that the step size aims at")
@@ -78,7 +82,7 @@ class PPOConfig(Section):
     gae_lambda: float = Field(0.95, ge=0, le=1, description="lambda of generalised advantage estimation")
     clip: float = Field(0.2, gt=0, description="clip range of the probability ratio")
     entropy: float = Field(0.0, ge=0, description="weight of the entropy bonus")
-    passes: Positive = Field(4, description="passes over each rollout")
+    passes: Repeats = Field(4, description="passes over each rollout")
     minibatches: Positive = Field(8, description="minibatches per pass")
     initial_std: float = Field(0.8, gt=0, description="initial standard deviation of actions in [-1, 1]")
     min_std: float = Field(0.05, gt=0, description="floor of the standard deviation")
@@ -88,7 +92,7 @@ class PPOConfig(Section):
 class BufferedConfig(Section):
     """Settings of what learns from batches of a buffer."""
 
-    batch_size: Positive = Field(128, description="transitions per update")
+    batch_size: Batch = Field(128, description="transitions per update")
     buffer_size: Positive = Field(200_000, description="transitions kept")
 
     @model_validator(mode="after")
@@ -101,13 +105,13 @@ class BufferedConfig(Section):
 class TD3Config(BufferedConfig):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018), as published for STAR."""
 
-    hidden: tuple[Positive, ...] = Field((300, 300), description="widths of the actor's and critics' layers")
+    hidden: Hidden = Field((300, 300), description="widths of the actor's and critics' layers")
     actor_learning_rate: float = Field(1e-4, gt=0, description="Adam step size of the actor")
     critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step size of the critics")
     discount: float = Field(0.95, ge=0, le=1, description="gamma per decision of the level")
     tau: float = Field(0.005, gt=0, le=1, description="rate at which the target networks follow")
     min_transitions: Positive = Field(1000, description="transitions needed before the first update")
-    updates_per_rollout: Positive = Field(10, description="gradient updates after each rollout")
+    updates_per_rollout: Repeats = Field(10, description="gradient updates after each rollout")
     policy_delay: Positive = Field(2, description="critic updates per actor update")
     target_noise: float = Field(0.2, ge=0, description="smoothing noise of target actions in [-1, 1]")
     target_noise_clip: float = Field(0.5, ge=0, description="clip of the smoothing noise")
@@ -143,7 +147,7 @@ class CommanderConfig(Section):
         "success",
         description="of a decision: mean success of its k env steps, or mean or maximum of r_ext",
     )
-    sweeps: Positive = Field(10, description="sweeps of value iteration of learner model after every k env steps")
+    sweeps: Repeats = Field(10, description="sweeps of value iteration of learner model after every k env steps")
     prior: float = Field(5.0, gt=0, description="decisions that weigh as much as the belief in what was not tried")
     memory: float = Field(0.5, ge=0, le=1, description="share of a decision's weight in the model left an epoch later")
     goal_margin: float = Field(
@@ -170,14 +174,14 @@ class AdjacencyConfig(Section):
     enabled: bool = Field(False, description="true penalises subgoals that are not adjacent, as in HRAC")
     weight: float = Field(20.0, ge=0, description="of the penalty in the loss of the Tutor's actor")
     cell: Positive = Field(1, description="side of the cells that states are rounded to (units of the state)")
-    hidden: tuple[Positive, ...] = Field((128, 128, 128), description="widths of the ReLU layers")
-    features: Positive = Field(32, description="size of the embedding")
+    hidden: Hidden = Field((128, 128, 128), description="widths of the ReLU layers")
+    features: Annotated[int, Field(gt=0, le=2**14)] = Field(32, description="size of the embedding")
     learning_rate: float = Field(2e-4, gt=0, description="Adam step size")
     near: float = Field(1.0, gt=0, description="adjacent cells are to be no further apart in the embedding")
     far: float = Field(1.2, gt=0, description="other cells are to be no closer in the embedding")
     limit: float = Field(1.1, gt=0, description="subgoals no further than this cost nothing")
-    batch_size: Positive = Field(512, description="anchors per update")
-    updates_per_epoch: Positive = Field(200, description="gradient updates after each epoch")
+    batch_size: Batch = Field(512, description="anchors per update")
+    updates_per_epoch: Repeats = Field(200, description="gradient updates after each epoch")
 
 
 class TutorConfig(LevelConfig):
@@ -192,7 +196,7 @@ class TutorConfig(LevelConfig):
     reward_scale: float = Field(0.3, gt=0, description="factor on the reward")
     relative_bounds: bool = Field(True, description="observe the region's bounds relative to the agent")
     off_policy_correction: bool = Field(False, description="relabel replayed subgoals (HIRO); needs learner td3")
-    correction_candidates: Positive = Field(10, description="random candidates of the off-policy correction")
+    correction_candidates: Batch = Field(10, description="random candidates of the off-policy correction")
     adjacency: AdjacencyConfig = AdjacencyConfig()
 
     @model_validator(mode="after")
@@ -241,11 +245,11 @@ class AbstractionConfig(Section):
 class ForwardModelConfig(BufferedConfig):
     """F_k: predicts where k steps under a commanded region lead."""
 
-    hidden: tuple[Positive, ...] = Field((32, 32), description="widths of the ReLU layers")
+    hidden: Hidden = Field((32, 32), description="widths of the ReLU layers")
     learning_rate: float = Field(1e-3, gt=0, description="Adam step size")
-    batch_size: Positive = Field(512, description="transitions per update")
+    batch_size: Batch = Field(512, description="transitions per update")
     buffer_size: Positive = Field(100_000, description="transitions kept")
-    updates_per_epoch: Positive = Field(200, description="gradient updates after each epoch")
+    updates_per_epoch: Repeats = Field(200, description="gradient updates after each epoch")
     residual: bool = Field(True, description="predict the displacement instead of the final state")
     boxes: Literal["commanded", "reached"] = Field(
         "commanded", description="train on the box that was commanded, or on the region that was reached"
@@ -273,16 +277,16 @@ class RefinementConfig(Section):
         32, description="parts of a region at most; each round of halving begins with those visited most"
     )
     min_visits: Positive = Field(10, description="visited start states a reaching box needs")
-    pairs_per_epoch: Positive = Field(16, description="pairs examined after each epoch")
+    pairs_per_epoch: Repeats = Field(16, description="pairs examined after each epoch")
     cuts: Literal["best", "random"] = Field("best", description="where a region is cut; random is for comparison")
-    cuts_per_pair: Positive = Field(1, description="cuts one examined pair may make")
+    cuts_per_pair: Repeats = Field(1, description="cuts one examined pair may make")
     miss_lifetime: Positive = Field(2, description="epochs after which a MISSES verdict is forgotten")
 
 
 class SelectionConfig(Section):
     """SGIM's choice of regions, strategies and goals."""
 
-    window: Annotated[int, Field(ge=4)] = Field(80, description="episodes remembered of each region")
+    window: Annotated[int, Field(ge=4, le=2**20)] = Field(80, description="episodes remembered of each region")
     per_block: Positive = Field(16, description="episodes of one block that each region remembers at most")
     drift: float = Field(
         0.001, gt=0, description="doubt about what a strategy adds grows by this in a block; it begins with 1"
@@ -325,7 +329,7 @@ class EpochSelectionConfig(SelectionConfig):
 class TeacherConfig(Section):
     """One teacher: demonstrations, what they are used for, and what it takes to ask."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$")] = Field(description="in metrics and figures")
+    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$", max_length=64)] = Field(description="in metrics and figures")
     kind: Literal["action", "outcome", "decomposition"] = Field(
         description="what is shown: movements to imitate, outcomes to aim at, or routes to a goal"
     )
@@ -347,7 +351,7 @@ class SgimConfig(Section):
         min_length=1,
         description="ways to practise alone: as ever, by random subgoals, or via a region",
     )
-    teachers: tuple[TeacherConfig, ...] = Field((), description="teachers that may be asked for help")
+    teachers: tuple[TeacherConfig, ...] = Field((), max_length=64, description="teachers that may be asked for help")
     ask: Literal["progress", "evenly"] = Field(
         "progress", description="which strategy: by progress over cost, or each as often, as in SGIM-D"
     )
@@ -365,7 +369,7 @@ class SgimConfig(Section):
     imitation: float = Field(
         1.0, ge=0, description="weight of what is demonstrated in the losses of the Tutor's and Controller's actors"
     )
-    imitation_batch: Positive = Field(256, description="demonstrated actions in each of its updates")
+    imitation_batch: Batch = Field(256, description="demonstrated actions in each of its updates")
     selection: EpochSelectionConfig = EpochSelectionConfig()
 
     @property
@@ -406,12 +410,16 @@ class SgimConfig(Section):
 class TrainerConfig(Section):
     """The host loop around the jitted epoch."""
 
-    num_envs: Positive = Field(128, description="environments stepped together, per seed")
-    total_env_steps: Positive = Field(2_000_000, description="env steps of all environments, per seed")
+    num_envs: Batch = Field(128, description="environments stepped together, per seed")
+    total_env_steps: Annotated[int, Field(gt=0, lt=2**63)] = Field(
+        2_000_000, description="env steps of all environments, per seed"
+    )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="first seed")
-    num_seeds: Positive = Field(1, description="seeds trained side by side: seed, seed + 1, ...")
+    num_seeds: Annotated[int, Field(gt=0, le=1024)] = Field(
+        1, description="seeds trained side by side: seed, seed + 1, ..."
+    )
     eval_every: Positive = Field(2, description="epochs between evaluations")
-    eval_episodes: Positive = Field(100, description="episodes of each evaluation, per seed")
+    eval_episodes: Batch = Field(100, description="episodes of each evaluation, per seed")
     checkpoint_every: Positive = Field(5, description="epochs between checkpoints")
     keep_checkpoints: Positive = Field(3, description="latest checkpoints kept, besides the best")
     on_non_finite: Literal["stop", "rollback"] = Field(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -12,6 +11,8 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from envs import reading
+from envs.options import shown
 from star.config import Config, ConfigError, Section
 
 
@@ -43,7 +44,7 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 def read_file(path: Path) -> dict[str, Any]:
     """What a YAML file with sections holds; raises `ConfigError`."""
     try:
-        values = read_yaml(path.read_text(encoding="utf-8"))
+        values = reading.plain(reading.text(path))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file{nearest_file(path, ('.yaml', '.yml'))}") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -51,32 +52,12 @@ def read_file(path: Path) -> dict[str, Any]:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" line {mark.line + 1} column {mark.column + 1}:" if mark else ""
-        raise ConfigError(f"{path}:{where} not valid YAML: {getattr(error, 'problem', None) or 'bad input'}") from None
-    except (RecursionError, ValueError) as error:
-        raise ConfigError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from None
+        raise ConfigError(f"{path}:{where} not valid YAML: {reading.problem(error)}") from None
     if values is None:
         values = {}
     if not isinstance(values, dict):
-        raise ConfigError(f"{path}: should hold sections such as `trainer:`, not {_show(values)}")
+        raise ConfigError(f"{path}: should hold sections such as `trainer:`, not {shown(values)}")
     return values
-
-
-class _UniqueKeys(yaml.SafeLoader):
-    """YAML's safe loader, but a key given twice is an error instead of a silent choice of the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, str) and key in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{key} is given twice", key_node.start_mark)
-            seen.add(key if isinstance(key, str) else id(key_node))
-        return super().construct_mapping(node, deep)
-
-
-def read_yaml(text: str) -> Any:
-    """What YAML `text` says; raises `yaml.YAMLError`, `ValueError` or `RecursionError` for what it cannot say."""
-    return yaml.load(text, _UniqueKeys)  # noqa: S506 - a SafeLoader
 
 
 def parse(
@@ -136,7 +117,7 @@ def _with_overrides(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> 
 
 def explain(error: ErrorDetails, model: type[BaseModel] = Config) -> str:
     """One pydantic error of `model` as one line: key, value, what is allowed."""
-    path = [str(part) for part in error["loc"]]
+    path = [part if len(part) <= 60 else f"{part[:57]}..." for part in map(str, error["loc"])]
     key = ".".join(path)
     if error["type"] == "extra_forbidden":
         return f"{key}: unknown key{_nearest_key(path, model)}"
@@ -145,7 +126,7 @@ def explain(error: ErrorDetails, model: type[BaseModel] = Config) -> str:
     message = message[:1].lower() + message[1:]
     if error["type"] == "value_error" and not isinstance(error["input"], str | int | float | bool):
         return f"{key}: {message}" if key else message
-    return f"{key}: {_show(error['input'])} is not allowed: {message}" if key else message
+    return f"{key}: {shown(error['input'])} is not allowed: {message}" if key else message
 
 
 def _nearest_key(path: Sequence[str], model: type[BaseModel]) -> str:
@@ -168,13 +149,9 @@ def _nearest_key(path: Sequence[str], model: type[BaseModel]) -> str:
 
 def nearest_file(path: Path, endings: Sequence[str]) -> str:
     """` (did you mean ...?)` with the file beside `path` whose name is most like it, of those with these endings."""
-    if not path.parent.is_dir():
+    try:
+        names = [entry.name for entry in path.parent.iterdir() if entry.suffix in endings]
+    except (OSError, ValueError):  # no such folder, or not one of ours
         return ""
-    names = [entry.name for entry in path.parent.iterdir() if entry.suffix in endings]
     matches = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
     return f" (did you mean {path.parent / matches[0]}?)" if matches else ""
-
-
-def _show(value: Any, limit: int = 60) -> str:
-    text = "nan" if isinstance(value, float) and math.isnan(value) else repr(value)
-    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -57,7 +57,7 @@ class JsonLines:
     def _parsed(self, line: bytes, number: int) -> dict[str, Any]:
         try:
             row = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             row = None
         if not isinstance(row, dict):
             raise ConfigError(f"{self.path}: line {number} is not a JSON object")

@@ -183,7 +183,7 @@ def checkpoints_figure(path: Path, *, runs: Mapping[str, Sequence[Row]]) -> None
         steps = [row["env_steps"] for row in ordered]
         for measure, style in zip(MEASURES, ("--", "-"), strict=True):
             bands = [row.get(f"{measure}_seeds_interval", row[f"{measure}_interval"]) for row in ordered]
-            label = f"{name} {measure.replace('_', ' ')}"
+            label = f"{literal(name)} {measure.replace('_', ' ')}"
             axis.plot(steps, [row[measure] for row in ordered], style, marker=".", color=f"C{number}", label=label)
             axis.fill_between(steps, *np.transpose(bands), color=f"C{number}", alpha=0.15, linewidth=0)
     axis.set(xlabel="env steps", ylabel="success of the checkpoint", ylim=(-0.02, 1.02))
@@ -198,7 +198,7 @@ def profile_figure(path: Path, *, groups: Sequence[Row], taus: np.ndarray) -> No
     for axis, measure in zip(figure.subplots(1, 2, sharey=True), MEASURES, strict=True):
         for number, group in enumerate(groups):
             found = group[measure]
-            axis.step(taus, found["profile"], where="post", color=f"C{number}", label=group["name"])
+            axis.step(taus, found["profile"], where="post", color=f"C{number}", label=literal(group["name"]))
             axis.fill_between(
                 taus, *found["profile_interval"], step="post", color=f"C{number}", alpha=0.15, linewidth=0
             )
@@ -268,6 +268,11 @@ def save(figure: Figure, path: Path) -> None:
     """Write a figure, and the folder it is to be in."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
+
+
+def literal(text: str) -> str:
+    """What a user typed, for a figure: matplotlib would set what is between two $ as a formula, or fail to."""
+    return text.replace("$", r"\$")
 
 
 def labels(runs: Sequence[Path]) -> list[str]:

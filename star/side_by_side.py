@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from star import evaluation
+from star import evaluation, memory
 from star import program as programs
 from star.config import Config
 from star.metrics import of_epoch
@@ -28,6 +28,7 @@ class SideBySide:
         """Compile for `slots` runs like `config`; raises `ConfigError` if it cannot be trained."""
         program = programs.build(config)
         program.lessons()
+        memory.check(program, copies=slots)
         self.slots = slots
         self.epochs = program.epochs
         self.env_steps_per_epoch = program.env_steps_per_epoch * config.trainer.num_seeds

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -46,7 +47,7 @@ def init(config: AgentConfig, spec: Spec, *, key: Array) -> TrainState:
     tutor_key, controller_key, model_key, adjacency_key, key = jax.random.split(key, 5)
     adjacent = config.tutor.adjacency
     abstraction = regions.create(spec.space, first_cuts(config, spec), max_regions=config.abstraction.max_regions)
-    tutor_example, controller_example = _examples(config, spec)
+    tutor_example, controller_example = examples(config, spec)
     return TrainState(
         commander=commander.init(config.commander, regions=abstraction.capacity),
         tutor=learner.init(tutor_key, config.tutor, example=tutor_example) if config.tutor.enabled else None,
@@ -90,6 +91,11 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(
             f"abstraction.grid: {list(grid)} has more parts than there are abstract dimensions, {dimensions}"
         )
+    if math.prod(grid) > config.abstraction.max_regions:  # said here, as `first_cuts` would write them all out
+        raise ValueError(
+            f"abstraction.grid: {math.prod(grid)} initial regions exceed abstraction.max_regions "
+            f"{config.abstraction.max_regions}"
+        )
     for name, section, decisions in config.learners():
         rollout = decisions * config.trainer.num_envs
         if section.learner == "td3" and section.td3.buffer_size < rollout:
@@ -100,7 +106,7 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(f"abstraction.{'cuts' if config.abstraction.grid is None else 'grid'}: {error}") from None
 
 
-def _examples(config: AgentConfig, spec: Spec) -> tuple[Transition, Transition]:
+def examples(config: AgentConfig, spec: Spec) -> tuple[Transition, Transition]:
     """Shapes of one transition of Tutor and Controller."""
     d, p, l, scalar = len(spec.abstract_indices), len(spec.scale), config.tutor.period, jnp.zeros(())
     rest = {"reward": scalar, "terminated": scalar, "cut": scalar, "weight": scalar}

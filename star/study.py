@@ -25,8 +25,9 @@ import numpy as np
 import optuna
 import sqlalchemy
 from optuna.distributions import BaseDistribution
-from optuna.samplers import BaseSampler
+from optuna.samplers import BaseSampler, CmaEsSampler
 from optuna.storages import RDBStorage, RetryHeartbeatStaleTrialCallback
+from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.pool import NullPool
 
@@ -235,6 +236,27 @@ class Holding:
                 with contextlib.suppress(Exception):
                     self._storage.record_heartbeat(trial._trial_id)
         self._storage.remove_session()  # that of this thread
+
+
+class Cmaes(CmaEsSampler):
+    """CMA-ES whose state is worked out anew from the trials.
+
+    Optuna's keeps it pickled in the database, so that whoever can write there could run code here.
+    """
+
+    _completed: Sequence[FrozenTrial] = ()
+
+    def _restore_optimizer(self, completed_trials: list[FrozenTrial]) -> None:
+        self._completed = completed_trials
+
+    def _init_optimizer(self, trans: Any, direction: StudyDirection) -> Any:
+        """The optimiser, told of all whole generations. What Optuna would tell it next is then one too few."""
+        optimizer = super()._init_optimizer(trans, direction)
+        sign = 1 if direction == StudyDirection.MINIMIZE else -1
+        size = optimizer.population_size
+        while len(told := self._get_solution_trials(list(self._completed), optimizer.generation)) >= size:
+            optimizer.tell([(trans.transform(one.params), sign * (one.value or 0.0)) for one in told[:size]])
+        return optimizer
 
 
 def reason(trial: FrozenTrial) -> str:

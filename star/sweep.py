@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from math import prod
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self, get_args
 
@@ -30,6 +31,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from envs import EnvError, files
+from envs.options import shown
 from star import faults, sweep_report
 from star import program as programs
 from star.config import Config, ConfigError, Positive
@@ -37,8 +39,9 @@ from star.loading import check_setting, explain, kind, load, parse, read_file
 from star.metrics import mean
 from star.side_by_side import SideBySide
 from star.stopping import interruptible
-from star.study import MEASURED, Holding, Ledger, product, reachable, reason
+from star.study import MEASURED, Cmaes, Holding, Ledger, product, reachable, reason
 
+_MAX_GRID = 100_000  # points
 _WAIT_S = 2.0  # between looks at what other workers do
 _MEASURES = ("success_any", "success_final")
 
@@ -69,9 +72,9 @@ class Parameter(_Model):
         if self.low is None or self.high is None:
             raise ValueError("should have both low and high")
         if self.low > self.high:
-            raise ValueError(f"low {self.low:g} is above high {self.high:g}")
+            raise ValueError(f"low {shown(self.low)} is above high {shown(self.high)}")
         if self.log and self.low <= 0:
-            raise ValueError(f"low {self.low:g} is not above 0, as log needs")
+            raise ValueError(f"low {shown(self.low)} is not above 0, as log needs")
         if self.log and self.step:
             raise ValueError("log and step exclude one another")
         return self
@@ -215,6 +218,8 @@ def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: An
     program = programs.build(base)
     evaluations = -(-program.epochs // base.trainer.eval_every)
     distributions = {key: _distribution(key, one, source=path) for key, one in sweep.parameters.items()}
+    if sweep.sampler == "grid" and prod(len(_points(one)) for one in distributions.values()) > _MAX_GRID:
+        raise ConfigError(f"{path}: parameters: make a grid of more than {_MAX_GRID:,} points")
     return Plan(sweep.study or path.stem, sweep, base, distributions, evaluations)
 
 
@@ -511,7 +516,7 @@ def _sampler(file: Sweep, seed: int) -> samplers.BaseSampler:
     if file.sampler == "tpe":
         return samplers.TPESampler(seed=seed)
     if file.sampler == "cmaes":
-        return samplers.CmaEsSampler(seed=seed)
+        return Cmaes(seed=seed)
     return samplers.RandomSampler(seed=seed)  # a grid draws nothing
 
 

@@ -15,9 +15,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from rich.table import Table
+from rich.text import Text
 
 from envs import files
-from star.report import save
+from star.report import literal, save
 
 Row = Mapping[str, Any]
 
@@ -49,11 +50,12 @@ def table(rows: Sequence[Row], *, parameters: Sequence[str], objective: str) -> 
     shown.add_column("trial", justify="right")
     shown.add_column("value", justify="right")
     for name in parameters:
-        shown.add_column(name.replace(".", ".\N{ZERO WIDTH SPACE}"), justify="right", overflow="fold")
+        shown.add_column(Text(name.replace(".", ".\N{ZERO WIDTH SPACE}")), justify="right", overflow="fold")
     shown.add_column("state")
     for row in ranked[:_SHOWN]:
         state = f"{row['state']}: {row['reason']}" if row["reason"] else row["state"]
-        shown.add_row(str(row["trial"]), _text(row["value"]), *[_text(row[name]) for name in parameters], state)
+        cells = [str(row["trial"]), _text(row["value"]), *[_text(row[name]) for name in parameters], state]
+        shown.add_row(*map(Text, cells))  # no markup: users typed some of it
     if len(ranked) > _SHOWN:
         shown.caption = f"and {len(ranked) - _SHOWN} more in trials.csv"
     return shown
@@ -103,7 +105,7 @@ def parallel_figure(rows: Sequence[Row], parameters: Sequence[str], objective: s
     for index in np.argsort(values):  # the best on top
         axis.plot(heights[:, index], color=colours.to_rgba(values[index]), alpha=0.8, linewidth=1.5)
     axis.set(ylim=(-0.05, 1.05), xlim=(-0.3, len(parameters) + 0.5))
-    names = [name.replace(".", ".\n") for name in parameters]
+    names = [literal(name).replace(".", ".\n") for name in parameters]
     axis.set_xticks(range(len(parameters) + 1), [*names, objective], fontsize="small")
     axis.set_yticks([])
     figure.colorbar(colours, ax=axis, label=objective)
@@ -154,7 +156,9 @@ def _draw_ticks(axis: Axes, x: int, heights: np.ndarray, texts: Sequence[str]) -
     last = -1.0
     for index in order:
         if heights[index] - last > 0.15 or last < 0:
-            axis.annotate(texts[index], (x, heights[index]), (4, 0), textcoords="offset points", fontsize="x-small")
+            axis.annotate(
+                literal(texts[index]), (x, heights[index]), (4, 0), textcoords="offset points", fontsize="x-small"
+            )
             last = heights[index]
 
 

@@ -11,6 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from star.evaluation import MEASURES
 
@@ -50,7 +51,7 @@ def evaluations(rows: Sequence[Row]) -> Table:
         table.add_column(name, justify="right")
     table.add_column("failed")
     for row in rows:
-        begin = [*(escape(row[name]) for name in about), f"{row['env_steps']:,}"]
+        begin: list[Text | str] = [*(Text(row[name]) for name in about), f"{row['env_steps']:,}"]
         for seed in row["seeds"]:
             failed = [str(number) for number in seed["failed"][:_SHOWN]]
             more = " ..." * (len(seed["failed"]) > _SHOWN)
@@ -72,7 +73,7 @@ def groups(found: Sequence[Row]) -> Table:
             _interval(group[name]["interquartile_mean"], group[name]["interquartile_mean_interval"])
             for name in MEASURES
         ]
-        table.add_row(escape(group["name"]), str(len(group["runs"])), str(seeds), *measured)
+        table.add_row(Text(group["name"]), str(len(group["runs"])), str(seeds), *measured)
     return table
 
 
@@ -88,7 +89,7 @@ def improvements(found: Sequence[Row]) -> Table:
             continue
         seen.add(both)
         measured = [_interval(pair[name], pair[f"{name}_interval"]) for name in MEASURES]
-        table.add_row(escape(pair["better"]), escape(pair["than"]), *measured)
+        table.add_row(Text(pair["better"]), Text(pair["than"]), *measured)
     return table
 
 

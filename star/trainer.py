@@ -12,7 +12,19 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from star import checkpoint, devices, evaluation, faults, profiling, provenance, report, rollback, sinks, starting
+from star import (
+    checkpoint,
+    devices,
+    evaluation,
+    faults,
+    memory,
+    profiling,
+    provenance,
+    report,
+    rollback,
+    sinks,
+    starting,
+)
 from star import program as programs
 from star.checkpoint import Checkpoints
 from star.config import Config, ConfigError
@@ -67,6 +79,7 @@ def train(
     sinks.check(config)
     program = programs.build(config)
     program.lessons()  # refused before anything is written
+    memory.check(program)
     first = devices.first()
     console = console or Console(stderr=True, quiet=not first)
     warn = partial(_warn, console)

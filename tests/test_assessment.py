@@ -188,7 +188,7 @@ def test_a_damaged_checkpoint_is_told_in_one_line(run, tmp_path, capsys, damage,
 
 def test_the_folder_of_an_evaluation_holds_its_rows_and_a_figure_for_everything_in_them(evaluated, run, tmp_path):
     rows, *_ = evaluated
-    groups = {"moving": [run], "still": [Path(rows[-1]["run"])]}
+    groups = {"mo$\\frac$ing": [run], "still": [Path(rows[-1]["run"])]}
     comparison = assessment.compare(rows, groups)
     assert comparison["groups"][1]["success_any"]["scores"] == {
         'point_maze {"episode_length": 40}': [seed["success_any"] for seed in rows[2]["seeds"]]

@@ -9,7 +9,7 @@ import jax
 import pytest
 
 import envs
-from star import assessment, trainer
+from star import assessment, tables, trainer
 from star.cli import main, split_settings
 from star.config import Config, ConfigError
 from star.loading import fields
@@ -65,6 +65,13 @@ def evaluation(run, *, env_steps):
     row = {"episodes": 8} | shares | others | {f"{name}_interval": [0.25, 0.75] for name in shares}
     about = {"run": run, "env": "point_maze", "options": {}, "engine": "jax", "env_steps": env_steps, "goals": "test"}
     return about | row | {"seeds": [{"seed": 3} | row | {"failed": [2, 5, 6, 7]}]}
+
+
+def test_a_table_names_runs_as_they_are_called(capsys):
+    names = ["[red]a[/red]", ":smile:", "<script>"]
+    tables.show([evaluation(name, env_steps=10) for name in names], None, again="")
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in names)
 
 
 def contents(folder):
@@ -409,3 +416,19 @@ def test_the_program_itself_prints_help_and_no_warnings():
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | where, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith("usage: star")
+
+
+@pytest.mark.parametrize("key", ["\\e[31mred", "two\\nlines", "\\ud800", "\\u202egpj", "x" * 5000])
+def test_a_refusal_is_one_printable_line_whatever_was_typed(folder, capsys, key):
+    (folder / "odd.yaml").write_text(f'"{key}": 1\n')
+    assert main(["train", "odd.yaml", "--run-dir", "new"]) == 2
+    line = capsys.readouterr().err.removesuffix("\n")
+    assert line.startswith("error: odd.yaml: ") and line.isprintable() and len(line) < 1200
+    assert not (folder / "new").exists()
+
+
+@pytest.mark.parametrize("words", [["--run-dir", "x" * 300], ["--resume", "x" * 300], ["x" * 300]])
+def test_a_name_that_no_file_can_have_is_refused_in_one_line(words, capsys):
+    config = [] if words[0] != "--run-dir" else ["point.yaml"]
+    assert main(["train", *config, *words, "--trainer.device", "cpu"]) == 2
+    assert "File name too long" in capsys.readouterr().err

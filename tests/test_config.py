@@ -201,6 +201,62 @@ def test_absurd_yaml_is_refused_in_one_line(write, text):
     assert "not valid YAML" in refusal(write(text))
 
 
+def bomb(first, grown):
+    """Ten lines that stand for a thousand million values."""
+    return "\n".join(
+        [f"a0: &a0 {first}", *(f"a{i}: &a{i} {grown.format(', '.join([f'*a{i - 1}'] * 9))}" for i in range(1, 10))]
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (bomb("[x]", "[{}]"), "more than 20,000 values, aliases written out"),
+        (bomb("{x: 1}", "{{<<: [{}]}}"), "more than 20,000 values, aliases written out"),
+        ("env: &e {options: *e}", "an alias lies inside of what it stands for"),
+        ("env: {options: " + "[" * 40 + "]" * 40 + "}", "nested more than 32 deep"),
+        ("a: " + "{a: " * 5000 + "}" * 5000, "nested more than 32 deep"),
+        ("trainer: {seed: !!timestamp x}", "not valid YAML"),
+        ("trainer: {seed: !!bool x}", "not valid YAML"),
+        ("trainer: {seed: !!int ''}", "not valid YAML"),
+        ("trainer: {seed: 0x" + "f" * 5000 + "}", "a number of thousands of digits is not allowed"),
+        ("trainer: !!python/object/apply:os.system [id]", "could not determine a constructor"),
+        ("x" * 2_000_000, "cannot be read: More than 1,000,000 characters"),
+    ],
+)
+def test_yaml_that_grows_or_runs_code_is_refused_in_one_line(write, text, told):
+    message = refusal(write(text))
+    assert told in message and len(message) < 400
+
+
+def test_an_alias_may_be_used_where_it_stands_for_little(write):
+    config = load(write("tutor: {ppo: &ppo {hidden: [8]}}\ncontroller: {ppo: *ppo}"))
+    assert config.tutor.ppo == config.controller.ppo != Config().controller.ppo
+
+
+@pytest.mark.parametrize("path", ["/dev/zero", "/dev/stdin", "a\0b", "x" * 300])
+def test_what_is_no_regular_file_is_not_read(path):
+    assert "regular" in refusal(path) or "no such file" in refusal(path) or "too long" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("trainer.num_envs", 10**12),
+        ("trainer.num_seeds", 10**400),
+        ("controller.ppo.hidden", [10**9]),
+        ("controller.ppo.hidden", [1] * 1000),
+        ("controller.td3.buffer_size", 10**15),
+        ("abstraction.max_regions", 10**6),
+        ("forward_model.updates_per_epoch", 2**31),
+        ("tutor.period", 2**63),
+    ],
+)
+def test_whole_numbers_beyond_all_use_are_refused(key, value):
+    with pytest.raises(ConfigError, match=rf"{key}(\.0)?: .* is not allowed: .*(less than|at most)"):
+        parse({}, {key: value})
+
+
 def test_overrides_win_over_the_file_at_any_depth(write):
     path = write("tutor: {period: 15, ppo: {clip: 0.3, passes: 2}}")
     config = load(path, {"tutor.period": 5, "tutor.ppo.clip": 0.1, "env.options.episode_length": 100})

@@ -1,9 +1,12 @@
 import argparse
+import collections
 import dataclasses
 import importlib.util
 import json
 import random
 import shutil
+import sys
+import time
 from pathlib import Path
 
 import jax
@@ -30,6 +33,7 @@ SCRIPTS = Path(__file__).parents[1] / "scripts"
 def load(name):
     spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # where dataclasses look for what their annotations mean
     spec.loader.exec_module(module)
     return module
 
@@ -318,3 +322,36 @@ def test_growth_of_memory_is_that_from_the_first_minute_after_settling_to_the_la
     assert found["host_mib"] == {"before": 400.0, "after": 403.0, "growth": 3.0}
     assert found["device_mib"]["growth"] == 0
     assert growth(samples, settle_s=1000) == {} == growth([], settle_s=0)
+
+
+@pytest.fixture
+def fuzz(monkeypatch):
+    """The script, which builds what is accepted and trains nothing."""
+    script = load("fuzz_configs")
+    monkeypatch.setattr(programs, "build", script.Shared(0))
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)  # `trainer.device: cpu` is for a process
+    return script
+
+
+def test_odd_configs_are_accepted_or_refused_in_one_line_and_leave_nothing_behind(fuzz):
+    ended = []
+    fuzz.fuzz(200, 1, limit=60, tell=lambda case, trial: ended.append((trial.ended, case, trial.line)))
+    counts = collections.Counter(one[0] for one in ended)
+    assert set(counts) <= {"refused", "built", "helped"}, [one for one in ended if one[0] not in ("refused", "built")]
+    assert counts["refused"] > 50 and counts["built"] > 10
+
+
+@pytest.mark.parametrize(
+    ("does", "ended"),
+    [
+        (lambda: print("error: a\nb", file=sys.stderr) or 2, "not one line"),
+        (lambda: print("error: a", file=sys.stderr) or Path("left").write_text("") or 2, "file left behind"),
+        (lambda: 1 / 0, "traceback"),
+        (lambda: 0, "no run, or more"),
+        (lambda: time.sleep(5), "hang"),
+        (lambda: print("error: a", file=sys.stderr) or 2, "refused"),
+    ],
+)
+def test_the_fuzzer_notices_what_is_wrong(fuzz, monkeypatch, does, ended):
+    monkeypatch.setattr(fuzz.cli, "main", lambda words: does())
+    assert fuzz.run(fuzz.Case("", (), {"config.yaml": b""}), limit=1).ended == ended

@@ -5,24 +5,33 @@ from __future__ import annotations
 import collections
 import contextlib
 import csv
+import io
+import json
 import os
+import pickle
 import pwd
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
 
+import numpy as np
+import optuna
 import pytest
 import yaml
+from optuna._transform import _SearchSpaceTransform
+from optuna.distributions import FloatDistribution, IntDistribution
+from rich.console import Console
 
-from star import cli, sweep
+from star import cli, sweep, sweep_report
 from star import program as programs
 from star.config import ConfigError
 from star.loading import fields, kind, load, parse
-from star.study import Ledger, reason
+from star.study import Cmaes, Ledger, reason
 from star.sweep import open_ledger, plan, work
 from tests.small import EPOCH, RUN
 
@@ -150,6 +159,54 @@ def test_samplers_stay_in_the_range_and_draw_no_trial_twice(folder, sampler):
     assert all(one["tutor.ppo.passes"] in (1, 2, 3) for one in drawn)
 
 
+def test_nothing_in_the_database_of_a_sweep_is_run(folder, monkeypatch):
+    """Optuna's CMA-ES would unpickle what it finds there."""
+    parameters = {
+        "controller.ppo.learning_rate": {"low": 1e-4, "high": 1e-2},
+        "tutor.ppo.passes": {"low": 1, "high": 3},
+    }
+    found, ledger = finished(written(parameters=parameters, sampler="cmaes", trials=3, batch=3))
+    ledger.close()
+    with contextlib.closing(sqlite3.connect("out/sweep.db")) as database, database:
+        row = (1, "cma:optimizer:0", json.dumps(pickle.dumps(print).hex()))
+        database.execute("INSERT INTO trial_system_attributes (trial_id, key, value_json) VALUES (?, ?, ?)", row)
+    ledger = open_ledger(found, "sqlite:///out/sweep.db")
+    assert "cma:optimizer:0" in ledger.trials()[0].system_attrs
+    monkeypatch.setattr(pickle, "loads", lambda _: pytest.fail("was unpickled"))
+    assert len(ledger.take(found.distributions, 2, limit=5, worker="me")) == 2
+
+
+def test_cmaes_worked_out_from_the_trials_is_the_one_that_optuna_keeps():
+    space = {"a": FloatDistribution(1e-4, 1, log=True), "b": IntDistribution(1, 9)}
+    study = optuna.create_study(direction="maximize")
+    for seed in range(20):
+        study.sampler = optuna.samplers.CmaEsSampler(seed=seed)
+        trial = study.ask(space)
+        study.tell(trial, -((trial.params["a"] - 0.1) ** 2) - (trial.params["b"] - 4) ** 2)
+    kept = optuna.samplers.CmaEsSampler()._restore_optimizer(study.trials)
+    ours = Cmaes()
+    ours._restore_optimizer(study.trials)
+    again = ours._init_optimizer(_SearchSpaceTransform(space, transform_0_1=True), study.direction)
+    assert again.generation == kept.generation >= 2
+    np.testing.assert_allclose(again._mean, kept._mean)
+    np.testing.assert_allclose(again._C, kept._C)
+
+
+def test_names_and_values_reach_table_and_figures_as_they_were_typed(tmp_path):
+    odd = ["[red]a[/red]", ":smile:", "$\\frac", "<script>"]
+    rows = [
+        {"trial": i, "state": "complete", "value": 0.1 * i, "env.options.map": text, "reason": ""}
+        for i, text in enumerate(odd)
+    ]
+    console = Console(width=200, file=io.StringIO())
+    console.print(sweep_report.table(rows, parameters=["env.options.map"], objective="success"))
+    assert all(text in console.file.getvalue() for text in odd)
+    sweep_report.write(
+        tmp_path, rows, parameters=["env.options.map"], objective="success", shares={"env.options.map": 1.0}
+    )
+    assert (tmp_path / "figures" / "parallel.png").exists()
+
+
 @pytest.mark.parametrize(("summary", "value"), [("end", 1.0), ("mean", 0.75)])
 def test_the_value_is_that_at_the_end_or_the_mean_of_all_evaluations(folder, summary, value):
     _, ledger = finished(written(summary=summary))
@@ -231,6 +288,11 @@ def test_every_shipped_sweep_is_valid_and_trains_side_by_side(path):
         ({"parameters": {"tutor.enabled": {"low": 0, "high": 1}}, "sampler": "tpe"}, "tutor.enabled"),
         ({"parameters": {"env.options.mapp": ["a"]}}, "mapp"),
         ({"sampler": "cmaes"}, "cmaes needs two or more"),
+        ({"parameters": {"tutor.ppo.passes": {"low": 10**400, "high": 1}}}, "is above high 1"),
+        (
+            {"parameters": {f"refinement.{key}": {"low": 1, "high": 500} for key in ("min_visits", "min_transitions")}},
+            "a grid of more than 100,000 points",
+        ),
         ({"sampler": "best"}, "sampler: 'best' is not allowed"),
         ({"sampla": "grid"}, "sampla: unknown key (did you mean sampler?)"),
         ({"config": "no.yaml"}, "no.yaml: no such file"),

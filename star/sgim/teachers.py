@@ -20,6 +20,8 @@ The last three are there together or not at all: a teacher may show no actions.
 
 from __future__ import annotations
 
+import math
+import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -30,7 +32,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from envs import EnvError, files, routes
+from envs import EnvError, files, reading, routes
 from envs.arena import FREE, GOAL, ROBOT
 from star.config import ConfigError
 from star.loading import nearest_file
@@ -41,6 +43,8 @@ ENDINGS = (".npz",)
 BEYOND = 0.25  # how far out of the space a file's points may be, as a share of its extent
 SAME = 1e-3  # m between two points that are meant to be one
 STANDING = 0.5  # height of a body above the floor, in m, as in the goals of Ant Fall
+MAX_ARRAYS = 16  # in a file
+MAX_BYTES = 4 * 2**30  # of all arrays of a file
 MAX_ENDS = 128  # cells of a maze between which routes are shown
 
 
@@ -183,14 +187,36 @@ _TRAJECTORIES = ("states", "actions", "lengths")
 def _read(path: Path) -> dict[str, np.ndarray]:
     """The arrays in the file `path`."""
     try:
+        reading.check_regular(path)
+        with zipfile.ZipFile(path) as archive:
+            _check_sizes(archive)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
             return {name: np.asarray(found[name]) for name in found.files}
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file{nearest_file(path, ENDINGS)}") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from None
     except Exception:  # NumPy raises nearly anything for a file that is not what it seems
         raise ConfigError(f"{path}: is not an .npz of plain arrays") from None
+
+
+def _check_sizes(archive: zipfile.ZipFile) -> None:
+    """Raise `ConfigError` for what would take much memory to read: it can be written in a few bytes."""
+    members = archive.infolist()
+    if len(members) > MAX_ARRAYS:
+        raise ConfigError(f"holds {len(members)} arrays; allowed: up to {MAX_ARRAYS}")
+    total = sum(member.file_size for member in members)
+    if total > MAX_BYTES:
+        raise ConfigError(f"holds {total / 2**30:.1f} GiB; allowed: up to {MAX_BYTES / 2**30:g} GiB")
+    for member in members:
+        with archive.open(member) as file:
+            version = np.lib.format.read_magic(file)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = read(file)
+        if math.prod(shape) * dtype.itemsize > member.file_size:
+            raise ConfigError(f"{member.filename} is shorter than it claims")
 
 
 def _check_about(number: np.ndarray | None, name: np.ndarray | None, env: str) -> None:

@@ -209,7 +209,7 @@ def test_an_end_that_is_no_truncation_terminates():
     ("options", "words"),
     [
         ({"goal": "test"}, ["goal", "goals"]),
-        ({"episode_length": 0}, ["episode_length", "0", "above 0"]),
+        ({"episode_length": 0}, ["episode_length", "0", "from 1 to"]),
         ({"engine": "wrap"}, ["wrap", "allowed"]),
     ],
 )

@@ -14,7 +14,7 @@ import envs
         ("point_mase", {}, ["point_mase", "point_maze", "ant_maze"]),
         ("point_maze", {"goal": "test"}, ["goal", "test", "goals"]),
         ("point_maze", {"goals": "tests"}, ["goals", "tests", "train, test"]),
-        ("point_maze", {"episode_length": 0}, ["episode_length", "0", "above 0"]),
+        ("point_maze", {"episode_length": 0}, ["episode_length", "0", "from 1 to"]),
         ("point_maze", {"episode_length": True}, ["episode_length", "True", "whole number"]),
         ("point_maze", {"engine": "native"}, ["native", "auto, jax"]),
         ("ant_maze", {"engine": "wrap"}, ["wrap", 'did you mean "warp"']),

@@ -1,6 +1,8 @@
 """Teachers: what they show, which demonstration is asked for, and the files that demonstrations are kept in."""
 
+import zipfile
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -283,6 +285,38 @@ def test_what_is_no_file_of_arrays_is_refused_in_one_line(tmp_path, write):
     with pytest.raises(ConfigError) as error:
         teachers.load(path, **ABOUT)
     assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
+
+
+def _array(shape, data=b""):
+    """An array of floats as a file of NumPy, with a header that may not be true of its data."""
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}}}".encode()
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + data
+
+
+@pytest.mark.parametrize(
+    ("members", "said"),
+    [
+        ({"starts.npy": _array((10**15,))}, "starts.npy is shorter than it claims"),
+        ({"starts.npy": _array((2, 10**9), b"\0" * 80)}, "starts.npy is shorter than it claims"),
+        ({f"{i}.npy": _array((0,)) for i in range(17)}, "holds 17 arrays; allowed: up to 16"),
+        ({"starts.npy": _array((2000,), b"\0" * 8000)}, "holds 0.0 GiB; allowed: up to"),
+    ],
+)
+def test_an_archive_that_would_take_much_memory_is_refused_unread(tmp_path, monkeypatch, members, said):
+    monkeypatch.setattr(teachers, "MAX_BYTES", 4000)
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("was read"))
+    path = tmp_path / "demos.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    with pytest.raises(ConfigError) as error:
+        teachers.load(path, **ABOUT)
+    assert str(error.value).startswith(f"{path}: {said}") and "\n" not in str(error.value)
+
+
+def test_a_device_is_no_file_of_demonstrations():
+    with pytest.raises(ConfigError, match="/dev/zero: cannot be read: Not a regular file"):
+        teachers.load(Path("/dev/zero"), **ABOUT)
 
 
 @settings(max_examples=60)

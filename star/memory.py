@@ -1,0 +1,81 @@
+"""The memory that a run needs at least: one that cannot fit is refused before anything is written."""
+
+from __future__ import annotations
+
+import math
+import os
+from typing import Any
+
+import jax
+
+from star import state as states
+from star.config import ConfigError
+from star.program import Program
+
+_NUMBER = 4  # bytes
+
+
+def check(program: Program, *, copies: int = 1) -> None:
+    """Raise `ConfigError` if so many runs of `program` side by side cannot fit into the memory of the device."""
+    found, room = needed(program), available()
+    total = copies * sum(found.values())
+    if total > room:
+        largest = max(found, key=lambda name: found[name])
+        raise ConfigError(
+            f"the run needs at least {_size(total)} of memory, {_size(copies * found[largest])} of it for {largest}; "
+            f"there are {_size(room)}"
+        )
+
+
+def needed(program: Program) -> dict[str, int]:
+    """Bytes for each part of the state, and for the largest of what comes and goes in an epoch; a lower bound."""
+    state = jax.eval_shape(program.functions.init, program.agent, program.seed_keys())
+    found = {name: _bytes(part) for name, part in vars(state).items() if name != "key"}
+    passing = _passing(program)
+    largest = max(passing, key=lambda name: passing[name])
+    found[largest] = found.get(largest, 0) + passing[largest]
+    return found
+
+
+def available() -> int:
+    """Bytes of the memory of all devices, or of this machine where the device does not tell."""
+    limits = [(device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()]
+    known = [limit for limit in limits if limit]
+    return sum(known) if known else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _passing(program: Program) -> dict[str, int]:
+    """Bytes of rollouts, and of what networks keep of a batch to learn from it."""
+    config, seeds = program.config, len(program.seeds)
+    tutor, model, near = config.tutor, config.forward_model, config.tutor.adjacency
+    found = {}
+    if config.commander.enabled:
+        found["forward_model"] = seeds * _activations(model.batch_size, model.hidden)
+    if tutor.off_policy_correction:  # the Controller's policy for each candidate
+        hidden = getattr(config.controller, config.controller.learner).hidden
+        rows = tutor.correction_candidates * tutor.td3.batch_size * tutor.period
+        found["tutor.correction_candidates"] = seeds * _activations(rows, hidden[:1])
+    if near.enabled:
+        found["tutor.adjacency"] = seeds * _activations(near.batch_size, (*near.hidden, near.features))
+    examples = dict(zip(("tutor", "controller"), states.examples(config.agent(), program.spec), strict=True))
+    for name, level, decisions in config.learners():
+        count = seeds * decisions * config.trainer.num_envs
+        found[f"{name}, trainer.num_envs"] = count * _bytes(examples[name])
+        if level.learner == "td3":
+            found[f"{name}.td3"] = seeds * _activations(level.td3.batch_size, level.td3.hidden)
+        else:
+            found[f"{name}.ppo"] = _activations(count // level.ppo.minibatches, level.ppo.hidden)
+    return found
+
+
+def _activations(rows: int, hidden: tuple[int, ...]) -> int:
+    return rows * sum(hidden) * _NUMBER
+
+
+def _bytes(tree: Any) -> int:
+    leaves = jax.tree.leaves(tree)
+    return sum(math.prod(x.shape) * (x.dtype.itemsize if hasattr(x.dtype, "itemsize") else _NUMBER) for x in leaves)
+
+
+def _size(count: int) -> str:
+    return f"{count / 2**30:,.1f} GiB"
