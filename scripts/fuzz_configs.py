@@ -20,6 +20,7 @@ import argparse
 import contextlib
 import dataclasses
 import faulthandler
+import gc
 import io
 import json
 import os
@@ -52,6 +53,7 @@ from star.config import Config  # noqa: E402
 
 CHUNK = 100  # configs of one seed of hypothesis
 MOST_WORK = 100_000  # env steps and sampled transitions of an epoch and its evaluation
+MOST_HELD = 8  # programs at a time
 MEMORY = 12 * 2**30  # bytes of addresses
 
 BASE: dict[str, Any] = {
@@ -354,17 +356,21 @@ class Shared:
     def __init__(self, structures: int) -> None:
         self.left = structures
         self.known: dict[str, programs.Program] = {}
+        """The latest used comes last."""
         self._build = programs.build
 
     def __call__(self, config: Config) -> programs.Program:
         """The program of `config`; raises what building it does."""
         key = self._key(config)
-        program = self.known.get(key) if key else None
-        if program is None:
+        program = self.known.pop(key, None) if key else None
+        if program is not None:
+            self.known[str(key)] = program
+        else:
             program = self._build(config)
             if key and self.left > 0 and _work(program) <= MOST_WORK:
                 self.left -= 1
                 self.known[key] = program
+                self._forget()
             else:
                 program = dataclasses.replace(program, functions=_never(program.functions))
         resolved = programs.resolve(config, program.config.env.engine, program.spec)
@@ -374,6 +380,12 @@ class Shared:
         return dataclasses.replace(
             program, config=resolved.model_copy(update={"trainer": once}), agent=resolved.agent()
         )
+
+    def _forget(self) -> None:
+        """Let go of the program that was not used for longest: a process may map so many pieces of code only."""
+        if len(self.known) > MOST_HELD:
+            del self.known[next(iter(self.known))]
+            gc.collect()
 
     def _key(self, config: Config) -> str | None:
         """None for what depends on files, and is not shared."""
@@ -547,7 +559,7 @@ def main() -> int:
         fuzz(CHUNK, options.seed * 1_000_003 + found["chunks"], limit=options.limit, tell=tell)
         found["chunks"] += 1  # of which hypothesis may have made fewer configs than it could
         found["wall_s"] = round(found["wall_s"] + time.monotonic() - began, 1)
-        found["structures"] = max(found.get("structures", 0), len(shared.known))
+        found["structures"] = max(found.get("structures", 0), options.structures + 1 - shared.left)
         found |= about
         options.out.parent.mkdir(parents=True, exist_ok=True)
         partial = options.out.with_suffix(".partial")
