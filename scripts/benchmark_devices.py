@@ -25,8 +25,6 @@ import json
 import platform
 import statistics
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +34,7 @@ from envs.vector import VectorEnv
 from star import cli, devices
 from star import program as programs
 from star.loading import load
+from star.profiling import timed
 from star.program import Program
 
 _STEPS = 200  # env steps of a loop of physics alone
@@ -122,13 +121,6 @@ def physics(program: Program, repeats: int) -> list[float]:
         seconds, state = timed(loop, state, actions)
         times.append(seconds)
     return times[1:]
-
-
-def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Seconds of a call, and what it returns."""
-    began = time.perf_counter()
-    result = jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - began, result
 
 
 if __name__ == "__main__":

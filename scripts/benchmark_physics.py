@@ -18,7 +18,6 @@ import argparse
 import json
 import platform
 import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ import jax.numpy as jnp
 
 import envs
 from envs.ant import MAX_TORQUE
+from star.profiling import timed
 
 
 def main() -> None:
@@ -104,13 +104,6 @@ def loop(step: Callable[[Any, jax.Array], Any]) -> Callable[[Any, jax.Array], An
     return jax.jit(
         lambda carry, actions: jax.lax.scan(lambda c, a: (step(c, a), None), carry, actions)[0], donate_argnums=0
     )
-
-
-def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Seconds of a call, and what it returns."""
-    began = time.perf_counter()
-    result = jax.block_until_ready(function(*arguments))
-    return time.perf_counter() - began, result
 
 
 if __name__ == "__main__":

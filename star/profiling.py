@@ -1,14 +1,17 @@
-"""A trace of some epochs by JAX's profiler, for Perfetto and XProf."""
+"""Where the time goes: a trace of some epochs by JAX's profiler, for Perfetto and XProf, and a stopwatch."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Self
+from typing import Any, Self, TypeVar
 
 import jax
 
 from star.config import ConfigError
+
+T = TypeVar("T")
 
 
 class Profile:
@@ -55,6 +58,13 @@ class Profile:
             self._warn(_failed(error))
             return
         self._say(f"profile: open {newest} in Perfetto (ui.perfetto.dev), or {self._folder} in XProf")
+
+
+def timed(function: Callable[..., T], *arguments: Any) -> tuple[float, T]:
+    """Seconds of a call, its result awaited, and what it returns."""
+    began = time.perf_counter()
+    result = jax.block_until_ready(function(*arguments))
+    return time.perf_counter() - began, result
 
 
 def plan(*, done: int, total: int, eval_every: int, epochs: int) -> int:

@@ -26,7 +26,8 @@ from envs.tasks import TASKS  # noqa: E402
 from star import episode, hierarchy, loading  # noqa: E402
 from star import program as programs  # noqa: E402
 from star.checkpoint import Checkpoints  # noqa: E402
-from star.spec import Spec
+from star.spec import Spec  # noqa: E402
+from tests.browser import program, started
 
 settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
 settings.load_profile("star")
@@ -104,6 +105,15 @@ def can_draw():
         opengl.backend()
     except envs.EnvError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory):
+    """A headless Chromium; skips the test where none is installed."""
+    if program() is None:
+        pytest.skip("no Chromium is installed")
+    with started(tmp_path_factory.mktemp("browser")) as browser:
+        yield browser
 
 
 @pytest.fixture(scope="session")

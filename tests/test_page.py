@@ -11,7 +11,6 @@ from star import page, report
 from star.cli import main
 from star.config import ConfigError
 from star.loading import load, parse
-from tests.browser import program, started
 
 CUTS = [0.0, 8.0, 12.0, 16.0]
 
@@ -239,14 +238,6 @@ def test_the_page_of_an_ordinary_run_is_below_two_megabytes(make, tmp_path):
     said = page.write({folder: load(folder / "config.yaml")}, tmp_path / "report.html")
     assert 0.3e6 < (tmp_path / "report.html").stat().st_size < 2e6
     assert said.endswith("MB; open it in a browser")
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if program() is None:
-        pytest.skip("no Chromium is installed")
-    with started(tmp_path_factory.mktemp("browser")) as browser:
-        yield browser
 
 
 NAME = "<img src=x onerror=pwned=1>"

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.browser import program, started
-
 SITE = Path(__file__).parents[1] / "site"
 PAGES = sorted(str(path.parent.relative_to(SITE)) for path in SITE.rglob("index.html"))
 
@@ -28,14 +26,6 @@ def address():
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
         server.shutdown()
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    if program() is None:
-        pytest.skip("no Chromium is installed")
-    with started(tmp_path_factory.mktemp("browser")) as browser:
-        yield browser
 
 
 @pytest.mark.parametrize("width", [1280, 390])
