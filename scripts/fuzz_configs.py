@@ -3,9 +3,10 @@
     python scripts/fuzz_configs.py --configs 10000 --out results/soak/fuzz.json
 
 A config is the smallest Point Maze, changed by hypothesis: in its values, its text, its bytes, the files it names or
-the command line. It goes through `star.cli.main` in a folder of its own and must end in one of two ways:
+the command line. It goes through `star.cli.main` in a folder of its own and must end in one of these ways:
 
 * trained for one epoch, with exit code 0 and nothing new in the folder but the run;
+* trained for one epoch and stopped with exit code 3 and one line, because of numbers that are no longer finite;
 * refused with exit code 2, one printable line on stderr and nothing new in the folder.
 
 Anything else is a failure: a traceback, other lines, a file left behind, more than `--limit` seconds. The exit code is
@@ -51,6 +52,7 @@ from star import cli, loading, provenance  # noqa: E402
 from star import program as programs  # noqa: E402
 from star.config import Config  # noqa: E402
 
+FINE = ("trained", "stopped", "built", "refused", "helped")
 CHUNK = 100  # configs of one seed of hypothesis
 MOST_WORK = 100_000  # env steps and sampled transitions of an epoch and its evaluation
 MOST_HELD = 8  # programs at a time
@@ -343,7 +345,7 @@ class _Untrained(BaseException):
 
 @dataclasses.dataclass
 class Trial:
-    """What became of a case: "trained", "built", "refused", "helped", or else what is wrong; and what was said."""
+    """What became of a case: one of `FINE`, or else what is wrong; and what was said."""
 
     ended: str
     line: str
@@ -483,16 +485,19 @@ def _judged(case: Case, folder: Path) -> tuple[str, str]:
     except BaseException:
         return "traceback", traceback.format_exc()
     said = err.getvalue()
+    line = said.removesuffix("\n")
+    begin = {2: "error: ", 3: "stopped: not finite "}.get(code, "")
+    if begin and not (line.startswith(begin) and line.isprintable() and said.endswith("\n")):
+        return "not one line", said
     if code == 2:
-        line = said.removesuffix("\n")
-        if not (line.startswith("error: ") and line.isprintable() and said.endswith("\n")):
-            return "not one line", said
         return ("refused", line) if _is_untouched(case, folder) else ("file left behind", line)
-    if code != 0:
+    if code not in (0, 3):
         return f"exit code {code}", said
     new = [path for path in folder.iterdir() if path.name not in case.files]
     written = [file.read_text().count("\n") for path in new for file in path.rglob("metrics.jsonl")]
-    return ("trained", said) if len(new) == 1 and written and written[0] else ("no run, or more", str(new))
+    if not (len(new) == 1 and written and written[0]):
+        return "no run, or more", str(new)
+    return "stopped" if code else "trained", said
 
 
 def _is_untouched(case: Case, folder: Path) -> bool:
@@ -548,7 +553,7 @@ def main() -> int:
         of = found["kinds"].setdefault(case.kind, {})
         of[trial.ended] = of.get(trial.ended, 0) + 1
         found["slowest_s"][trial.ended] = round(max(found["slowest_s"].get(trial.ended, 0.0), trial.seconds), 1)
-        if trial.ended not in ("trained", "built", "refused", "helped"):
+        if trial.ended not in FINE:
             failure = {"ended": trial.ended, "said": trial.line[-3000:], "kind": case.kind, "arguments": case.arguments}
             failure |= {"files": {name: repr(data[:3000]) for name, data in case.files.items()}}
             found["failures"].append(failure)

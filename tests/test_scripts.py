@@ -350,6 +350,8 @@ def test_odd_configs_are_accepted_or_refused_in_one_line_and_leave_nothing_behin
         (lambda: 0, "no run, or more"),
         (lambda: time.sleep(5), "hang"),
         (lambda: print("error: a", file=sys.stderr) or 2, "refused"),
+        (lambda: print("oh", file=sys.stderr) or 3, "not one line"),
+        (lambda: print("stopped: not finite after", file=sys.stderr) or 3, "no run, or more"),
     ],
 )
 def test_the_fuzzer_notices_what_is_wrong(fuzz, monkeypatch, does, ended):
