@@ -317,7 +317,7 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         config, run_dir, resume=options.resume is not None, quiet=options.quiet, profile=options.profile
     )
     if not devices.first():
-        return 3 if result.fault is not None else 130 if result.interrupted else 0
+        return 3 if result.fault is not None else 130 if result.interrupted and not result.terminated else 0
     if result.fault is not None:
         print(f"stopped: {result.fault}; {_after_a_fault(result, config.trainer)}", file=sys.stderr)
         return 3

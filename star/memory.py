@@ -17,7 +17,7 @@ _NUMBER = 4  # bytes
 
 def check(program: Program, *, copies: int = 1) -> None:
     """Raise `ConfigError` if so many runs of `program` side by side cannot fit into the memory of the device."""
-    found, room = needed(program), available()
+    found, room = needed(program), available(program.config.trainer.devices)
     total = copies * sum(found.values())
     if total > room:
         largest = max(found, key=lambda name: found[name])
@@ -37,11 +37,12 @@ def needed(program: Program) -> dict[str, int]:
     return found
 
 
-def available() -> int:
-    """Bytes of the memory of all devices, or of this machine where the device does not tell."""
-    limits = [(device.memory_stats() or {}).get("bytes_limit") for device in jax.devices()]
-    known = [limit for limit in limits if limit]
-    return sum(known) if known else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+def available(devices: int = 1) -> int:
+    """Bytes of the memory of so many devices like the first one here, or of the machines where it does not tell."""
+    limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit")
+    if limit:
+        return devices * limit
+    return jax.process_count() * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
 def _passing(program: Program) -> dict[str, int]:

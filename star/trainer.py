@@ -209,7 +209,7 @@ def _loop(
         env_steps,
         interrupted,
         records.success,
-        terminated=interrupted and stop.terminated,
+        terminated=interrupted and devices.anywhere(stop.terminated),
         fault=fault,
         saved=steps[-1] if steps else None,
     )
