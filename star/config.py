@@ -19,6 +19,9 @@ class ConfigError(ValueError):
     """A configuration that cannot be used; the message is one line for the user."""
 
 
+_LARGEST = 3.4e38  # of float32, in round numbers
+
+
 class Section(BaseModel):
     """A frozen group of settings that refuses unknown keys and is a JAX pytree with its floats as leaves."""
 
@@ -29,6 +32,13 @@ class Section(BaseModel):
     def _refuse_booleans_as_numbers(cls, value: Any, info: ValidationInfo) -> Any:
         if isinstance(value, bool) and cls.model_fields[str(info.field_name)].annotation in (int, float):
             raise ValueError("should be a number")
+        return value
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _refuse_what_float32_cannot_hold(cls, value: Any) -> Any:
+        if isinstance(value, float) and abs(value) > _LARGEST:
+            raise ValueError(f"should lie between {-_LARGEST:.3g} and {_LARGEST:.3g}")
         return value
 
     @classmethod

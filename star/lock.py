@@ -18,10 +18,11 @@ NAME = ".lock"
 def locked(run_dir: Path, *, warn: Callable[[str], None]) -> Iterator[None]:
     """Hold `run_dir` alone; raises `ConfigError` if another process does, or if the folder cannot be written.
 
-    The system releases the lock when the process ends, however it does; the file stays. Where the file system cannot
-    lock, that is said, and nothing is held.
+    The system releases the lock when the process ends, however it does; the file stays, unless it is new and what was
+    to be done is refused with `ConfigError`. Where the file system cannot lock, that is said, and nothing is held.
     """
     path = run_dir / NAME
+    new = not path.exists()
     try:
         file = path.open("a+", encoding="utf-8")
     except OSError as error:
@@ -40,4 +41,9 @@ def locked(run_dir: Path, *, warn: Callable[[str], None]) -> Iterator[None]:
                 file.truncate(0)
                 file.write(f"process {os.getpid()} on {platform.node()}")
                 file.flush()
-        yield
+        try:
+            yield
+        except ConfigError:
+            if new:
+                path.unlink(missing_ok=True)
+            raise

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from envs import EnvError, files
 from star import checkpoint, devices, lock
+from star import program as programs
 from star.checkpoint import Checkpoints
 from star.config import Config, ConfigError
 from star.loading import load
@@ -48,7 +49,8 @@ def restored(
     """The state to go on from, after what was measured later has been dropped. A damaged checkpoint is set aside."""
     run_dir = journal.metrics.path.parent
     if not checkpoints.steps():
-        for key, old, new in checkpoint.differences(load(run_dir / "config.yaml"), program.config):
+        noted = programs.resolve(load(run_dir / "config.yaml"), program.config.env.engine, program.spec)
+        for key, old, new in checkpoint.differences(noted, program.config):
             raise ConfigError(f"{run_dir}: was begun with {key} {old}, not {new}")
         warn(f"{run_dir}: holds no checkpoint, so it begins anew")
         journal.keep_until(0)

@@ -391,3 +391,9 @@ def test_every_shipped_layer_fits_every_shipped_config(pytestconfig, folder):
         faces = [file.stem for file in files if load(file).tutor.heading]  # only these have what no_heading takes away
         assert same == ([file.stem for file in files if file.stem not in faces] if layer.stem == "no_heading" else [])
         assert len(same) < len(files)
+
+
+def test_a_number_that_float32_cannot_hold_is_refused():
+    with pytest.raises(ConfigError, match=r": tutor.reward_scale: 1e\+300 is not allowed: should lie between -3.4e\+38"):
+        parse({}, {"tutor.reward_scale": 1e300})
+    assert parse({}, {"tutor.reward_scale": 1e38}).tutor.reward_scale == 1e38

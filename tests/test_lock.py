@@ -36,3 +36,12 @@ def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):
     with pytest.raises(ConfigError, match="none: cannot be written: No such file or directory"):
         with locked(tmp_path / "none", warn=unexpected):
             raise AssertionError
+
+
+def test_a_refusal_leaves_no_lock_behind(tmp_path):
+    for kept in (False, True):
+        if kept:
+            (tmp_path / ".lock").touch()
+        with pytest.raises(ConfigError, match="no"), locked(tmp_path, warn=unexpected):
+            raise ConfigError("no")
+        assert (tmp_path / ".lock").exists() == kept

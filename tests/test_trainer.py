@@ -573,3 +573,10 @@ def test_a_checkout_that_is_not_installed_says_where_it_runs_all_the_same(monkey
     monkeypatch.setattr(provenance, "_PACKAGES", ("jax", "no-such-package"))
     monkeypatch.setattr(provenance, "_process", provenance._process.__wrapped__)
     assert provenance.here()["versions"] == {"jax": jax.__version__, "no-such-package": None}
+
+
+def test_another_config_than_that_of_the_folder_is_refused_before_anything_is_written(tmp_path):
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(TINY), encoding="utf-8")
+    with pytest.raises(ConfigError, match="was begun with trainer.num_envs"):
+        trainer.train(tiny(trainer__num_envs=6), tmp_path, resume=True, quiet=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
