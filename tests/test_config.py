@@ -394,6 +394,6 @@ def test_every_shipped_layer_fits_every_shipped_config(pytestconfig, folder):
 
 
 def test_a_number_that_float32_cannot_hold_is_refused():
-    with pytest.raises(ConfigError, match=r": tutor.reward_scale: 1e\+300 is not allowed: should lie between -3.4e\+38"):
+    with pytest.raises(ConfigError, match=r": tutor.reward_scale: 1e\+300 is not allowed: should lie between"):
         parse({}, {"tutor.reward_scale": 1e300})
     assert parse({}, {"tutor.reward_scale": 1e38}).tutor.reward_scale == 1e38
