@@ -29,8 +29,7 @@ def check(program: Program, *, copies: int = 1) -> None:
 
 def needed(program: Program) -> dict[str, int]:
     """Bytes for each part of the state, and for the largest of what comes and goes in an epoch; a lower bound."""
-    state = jax.eval_shape(program.functions.init, program.agent, program.seed_keys())
-    found = {name: _bytes(part) for name, part in vars(state).items() if name != "key"}
+    found = {name: _bytes(part) for name, part in vars(program.example()).items() if name != "key"}
     passing = _passing(program)
     largest = max(passing, key=lambda name: passing[name])
     found[largest] = found.get(largest, 0) + passing[largest]

@@ -133,7 +133,7 @@ class Sweep(_Model):
 
 
 class Bench(Protocol):
-    """What trains a batch of trials: `star.SideBySide`."""
+    """What trains a batch of trials: `star.side_by_side.SideBySide`."""
 
     slots: int
     epochs: int
