@@ -316,18 +316,24 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     result = trainer.train(
         config, run_dir, resume=options.resume is not None, quiet=options.quiet, profile=options.profile
     )
-    if not devices.first():
-        return 3 if result.fault is not None else 130 if result.interrupted and not result.terminated else 0
+    if devices.first():
+        _say_how_it_ended(result, config.trainer)
     if result.fault is not None:
-        print(f"stopped: {result.fault}; {_after_a_fault(result, config.trainer)}", file=sys.stderr)
         return 3
+    return 130 if result.interrupted and not result.terminated else 0
+
+
+def _say_how_it_ended(result: Result, config: TrainerConfig) -> None:
+    run_dir = result.run_dir
+    if result.fault is not None:
+        print(f"stopped: {result.fault}; {_after_a_fault(result, config)}", file=sys.stderr)
+        return
     if result.interrupted:
         print(f"interrupted at {result.env_steps:,} env steps; go on with: star train --resume {run_dir}")
-        return 0 if result.terminated else 130
+        return
     success = "" if result.success_final is None else f", success_final {result.success_final:.2f} on test goals"
     print(f"trained {result.env_steps:,} env steps{success}")
     print(f"figure:  {run_dir}/figures/summary.png\nmetrics: {run_dir}/metrics.jsonl\nnext:    star evaluate {run_dir}")
-    return 0
 
 
 def _after_a_fault(result: Result, config: TrainerConfig) -> str:

@@ -208,8 +208,7 @@ def test_an_epoch_too_long_for_sigterm_is_given_up_and_the_one_before_it_saved(f
     assert result.terminated and result.env_steps == 3 * EPOCH
     assert Checkpoints(part).steps() == [2 * EPOCH, 3 * EPOCH]
     trainer.train(load(part / "config.yaml"), part, resume=True, quiet=True)
-    assert rows(part) == rows(run_dir)
-    assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+    assert_same_end(part, run_dir)
 
 
 def test_a_damaged_newest_checkpoint_is_set_aside_and_the_run_goes_on_from_the_one_before(finished, tmp_path, capsys):
@@ -227,8 +226,7 @@ def test_a_damaged_newest_checkpoint_is_set_aside_and_the_run_goes_on_from_the_o
     assert err.count("\n") == 1
     assert Journal.of(part).provenance.read()[-1]["env_steps"] == 2 * EPOCH
     assert {entry.name for entry in (part / "checkpoints").iterdir()} == {str(2 * EPOCH), str(4 * EPOCH)}
-    assert rows(part) == rows(run_dir)
-    assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+    assert_same_end(part, run_dir)
 
 
 def test_a_run_killed_before_its_first_checkpoint_begins_anew(finished, tmp_path, capsys):
@@ -280,8 +278,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_one_line_and_it_resumes(finished, 
             trainer.train(tiny(), part, quiet=True)
     assert Checkpoints(part).steps() == [2 * EPOCH] and rows(part) == rows(run_dir)
     trainer.train(tiny(), part, resume=True, quiet=True)
-    assert rows(part) == rows(run_dir)
-    assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
+    assert_same_end(part, run_dir)
 
 
 def test_a_run_of_an_older_format_goes_on_from_its_checkpoint(tmp_path, capsys):
@@ -567,6 +564,12 @@ def interrupt_after(monkeypatch, *, epochs, number=signal.SIGINT, then=lambda: N
 
 def assert_equal(one, other):
     jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def assert_same_end(part, run_dir):
+    """Two runs of `tiny()` have measured the same and saved the same state."""
+    assert rows(part) == rows(run_dir)
+    assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
 
 
 def test_a_checkout_that_is_not_installed_says_where_it_runs_all_the_same(monkeypatch):
