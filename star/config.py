@@ -8,11 +8,14 @@ hyperparameter side by side.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from types import NoneType
 from typing import Annotated, Any, Literal, Self
 
 import jax
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+
+from envs.options import shown
 
 
 class ConfigError(ValueError):
@@ -72,6 +75,13 @@ Repeats = Annotated[int, Field(gt=0, le=100_000)]
 Hidden = Annotated[tuple[Annotated[int, Field(gt=0, le=2**14)], ...], Field(max_length=16)]
 
 
+def _is_simple(value: Any) -> bool:
+    """Whether `value` is what JSON has too, but for mappings: YAML knows dates and bytes as well."""
+    if isinstance(value, list | tuple):
+        return all(map(_is_simple, value))
+    return isinstance(value, str | int | float | NoneType)
+
+
 class EnvConfig(Section):
     """The task and the engine that simulates it."""
 
@@ -79,6 +89,16 @@ class EnvConfig(Section):
     engine: Literal["auto", "warp", "jax", "native"] = Field("auto", description="physics engine")
     options: dict[str, Any] = Field({}, description="options of the task, passed to envs.make")
     training: dict[str, Any] = Field({}, description="options that differ in training from those above")
+
+    @field_validator("options", "training")
+    @classmethod
+    def _refuse_what_no_option_holds(cls, value: dict[str, Any]) -> dict[str, Any]:
+        for name, option in value.items():
+            if not _is_simple(option):
+                raise ValueError(
+                    f"{name}: {shown(option)} is not allowed: should be text, a number, true, false or a list"
+                )
+        return value
 
 
 class PPOConfig(Section):

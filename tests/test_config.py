@@ -91,6 +91,8 @@ def test_a_key_like_no_other_lists_those_of_its_section(write):
         ("tutor: 5", "tutor", "5", "dictionary"),
         ("tutor:", "tutor", "None", "dictionary"),
         ("env: {options: fast}", "env.options", "'fast'", "dictionary"),
+        ("env: {options: {goals: !!binary /w==}}", "env.options", "b'\\xff'", "text, a number"),
+        ("env: {training: {cell: [2020-01-01]}}", "env.training", "datetime.date(2020, 1, 1)", "text, a number"),
     ],
 )
 def test_a_wrong_type_names_key_value_and_what_is_allowed(write, text, key, value, allowed):
