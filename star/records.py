@@ -1,8 +1,9 @@
-"""What a run has measured so far, in memory and in its journal."""
+"""What a run has measured so far: in its journal, since in memory the rows of a long run would grow without end."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from star import report
@@ -12,18 +13,21 @@ from star.state import TrainState
 
 
 class Records:
-    """Rows of metrics and of regions; what is added is written down too."""
+    """Writes the rows of a run down, and knows of the latest ones."""
 
     def __init__(self, program: Program, journal: Journal) -> None:
         self.program, self.journal = program, journal
-        self.rows, self.regions = journal.metrics.read(), journal.regions.read()
-        self._began = time.monotonic() - (self.rows[-1]["wall_s"] if self.rows else 0.0)
+        rows = self.look_back()
+        self._began = time.monotonic() - (rows[-1]["wall_s"] if rows else 0.0)
 
-    @property
-    def success(self) -> float | None:
+    def look_back(self) -> list[dict[str, Any]]:
+        """Take what is latest, and return all rows of metrics, from the journal, which may have been cut."""
+        self.success: float | None = None
         """Mean `eval/success_final` of the latest evaluation."""
-        evaluated = [row for row in self.rows if "eval/success_final" in row]
-        return mean(by_step(evaluated)[-1], "eval/success_final") if evaluated else None
+        rows = self.journal.metrics.read()
+        for table in by_step(rows):
+            self._notice(table)
+        return rows
 
     def add(self, table: list[dict[str, Any]], *, env_steps: int, speed: float) -> None:
         """An epoch: one row for each seed."""
@@ -31,22 +35,26 @@ class Records:
             row |= {"env_steps": env_steps, "wall_s": round(time.monotonic() - self._began, 3)}
             row |= {"env_steps_per_s": round(speed)}
             self.journal.metrics.write(row)
-        self.rows.extend(table)
+        self._notice(table)
 
-    def add_regions(self, state: TrainState, *, env_steps: int, write: bool = True) -> None:
+    def add_regions(self, state: TrainState, *, env_steps: int) -> None:
         """The regions of each seed, if it has a Commander."""
+        for row in self._regions(state, env_steps):
+            self.journal.regions.write(row)
+
+    def regions(self, state: TrainState | None, *, env_steps: int) -> list[dict[str, Any]]:
+        """All rows of regions, those of `state` included, if there is one; it may not have been evaluated."""
+        rows, found = self.journal.regions.read(), [] if state is None else self._regions(state, env_steps)
+        return rows if rows and rows[-1]["env_steps"] == env_steps else rows + found
+
+    def _regions(self, state: TrainState, env_steps: int) -> list[dict[str, Any]]:
         program = self.program
         if not program.config.commander.enabled:
-            return
-        found = report.region_rows(
+            return []
+        return report.region_rows(
             program.config.agent(), state, seeds=program.seeds, env_steps=env_steps, goal=program.goal
         )
-        if write:
-            for row in found:
-                self.journal.regions.write(row)
-        self.regions.extend(found)
 
-    def keep_until(self, env_steps: int) -> None:
-        """Forget what came after `env_steps`; the journal has been cut already."""
-        self.rows = [row for row in self.rows if row["env_steps"] <= env_steps]
-        self.regions = [row for row in self.regions if row["env_steps"] <= env_steps]
+    def _notice(self, table: Sequence[Mapping[str, Any]]) -> None:
+        found = mean(table, "eval/success_final")
+        self.success = self.success if found is None else found

@@ -113,7 +113,7 @@ def train(
                 return result
             state = starting.restored(program, checkpoints, journal, warn=warn)
             began = _epochs(state) * program.env_steps_per_epoch
-            records.keep_until(began)
+            records.look_back()
             if result.interrupted:
                 return replace(result, env_steps=began, fault=None)
             profile = 0
@@ -161,8 +161,9 @@ def _loop(
     stop.on_first = display.stop
     spare: tuple[int, TrainState] | None = None  # (epochs, state) before what may take long
     trace = Profile(run_dir / "profile", first=profile[0], epochs=profile[1], say=display.say, warn=display.warn)
+    history = records.look_back()
     try:
-        with Sinks(run_dir, program.config, records.rows, warn=display.warn, muted=not devices.first()) as others:
+        with Sinks(run_dir, program.config, history, warn=display.warn, muted=not devices.first()) as others:
             with display, trace:
                 while done < program.epochs and fault is None and not asked():
                     trace.before(done)
@@ -191,11 +192,9 @@ def _loop(
                 if fault is None and saved != done:
                     save(done, state)
             env_steps = done * program.env_steps_per_epoch
-            known = records.regions and records.regions[-1]["env_steps"] == env_steps
-            if fault is None and not known:  # stopped between evaluations
-                records.add_regions(state, env_steps=env_steps, write=False)
+            regions = records.regions(state if fault is None else None, env_steps=env_steps)
             if devices.first():
-                _draw(run_dir / "figures", records)
+                _draw(run_dir / "figures", program, rows=records.journal.metrics.read(), regions=regions)
             others.figures(run_dir / "figures")
     except Overdue:
         done = max(saved, 0)  # where it is, if what is short took long for once
@@ -220,13 +219,13 @@ def _copied(state: TrainState) -> TrainState:
     return jax.tree.map(np.array, checkpoint.plain(state))
 
 
-def _draw(folder: Path, records: Records) -> None:
-    rows, regions, walls = records.rows, records.regions, records.program.walls
+def _draw(folder: Path, program: Program, *, rows: list[dict[str, Any]], regions: list[dict[str, Any]]) -> None:
+    walls = program.walls
     try:
         report.summary_figure(folder / "summary.png", regions=regions, rows=rows, walls=walls)
         if regions:
             report.growth_figure(folder / "growth.png", regions=regions, walls=walls)
-        if rows and records.program.config.sgim.enabled:
+        if rows and program.config.sgim.enabled:
             report.sgim_figure(folder / "sgim.png", regions=regions, rows=rows, walls=walls)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be written: {error.strerror}; the run itself is saved") from None
