@@ -60,7 +60,7 @@ MOST_HELD = 8  # programs at a time
 MEMORY = 12 * 2**30  # bytes of addresses
 
 BASE: dict[str, Any] = {
-    "env": {"name": "point_maze", "engine": "jax", "options": {"episode_length": 40}},
+    "env": {"name": "point_maze", "options": {"episode_length": 40}},
     "commander": {"period": 20},
     "tutor": {"unroll": 2, "ppo": {"hidden": [4], "passes": 1, "minibatches": 1}},
     "controller": {"ppo": {"hidden": [4], "passes": 1, "minibatches": 1}},

@@ -34,9 +34,9 @@ def gpus(config: Config) -> list[str]:
 
     Raises `ConfigError` if there are fewer than `trainer.devices`.
     """
-    count, trainer = config.trainer.devices, config.trainer
-    warp = config.env.engine in ("auto", "warp") and "warp" in TASKS[config.env.name].engines
-    if count == 1 or trainer.device == "cpu" or not warp or importlib.util.find_spec("warp") is None:
+    count, task = config.trainer.devices, TASKS.get(config.env.name)
+    warp = config.env.engine in ("auto", "warp") and task is not None and "warp" in task.engines
+    if count == 1 or config.trainer.device == "cpu" or not warp or importlib.util.find_spec("warp") is None:
         return []
     # in a process of its own, for one that has looked at the GPUs takes memory of all of them
     seen = subprocess.run([sys.executable, "-c", _LOOK], stdout=subprocess.PIPE, text=True, check=False).stdout.split()

@@ -1,62 +1,26 @@
-"""The host's side of a run: epochs, evaluation, checkpoints, metrics and the figure, around one jitted function."""
+"""The host's side of a run: what it is made of and where it begins; `star.stretch` takes it on from there."""
 
 from __future__ import annotations
 
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import jax
-import numpy as np
 from rich.console import Console
 
-from star import (
-    checkpoint,
-    devices,
-    evaluation,
-    faults,
-    memory,
-    profiling,
-    provenance,
-    report,
-    rollback,
-    sinks,
-    starting,
-)
+from star import devices, memory, profiling, provenance, rollback, sinks, starting
 from star import program as programs
 from star.checkpoint import Checkpoints
-from star.config import Config, ConfigError
-from star.display import Display, Stopwatch
-from star.episode import Episode
-from star.faults import Fault
+from star.config import Config
 from star.lock import locked
-from star.metrics import Journal, of_epoch
-from star.profiling import Profile
+from star.metrics import Journal
 from star.program import Program
 from star.records import Records
-from star.sinks import Sinks
 from star.state import TrainState
-from star.stopping import Overdue, Stop, interruptible
-
-_LONG_S = 3.0  # of what is to come a copy of the state is worth its time; shorter parts end in good time after SIGTERM
-
-
-@dataclass(frozen=True)
-class Result:
-    """How a call of `train` ended."""
-
-    run_dir: Path
-    env_steps: int
-    interrupted: bool
-    success_final: float | None
-    terminated: bool = False
-    """Whether it was SIGTERM that interrupted it."""
-    fault: Fault | None = None
-    """What was not finite, if that is why."""
-    saved: int | None = None
-    """Env steps of the last checkpoint."""
+from star.stopping import interruptible
+from star.stretch import Result, Stretch
 
 
 def train(
@@ -104,10 +68,10 @@ def train(
         records = Records(program, journal)
         while True:
             slowed, state = rollback.slowed(program, state, journal, env_steps=began)
-            result = _loop(
-                slowed, records, state, run_dir, checkpoints,
-                stop=stop, quiet=quiet, console=console, profile=(traced, profile),
-            )  # fmt: skip
+            result = Stretch(
+                slowed, records, checkpoints, run_dir,
+                done=_epochs(state), stop=stop, quiet=quiet, console=console, profile=(traced, profile),
+            ).run(state)  # fmt: skip
             fault = result.fault
             if fault is None or not rollback.goes_back(program, journal, fault, to=result.saved, warn=warn):
                 return result
@@ -119,143 +83,9 @@ def train(
             profile = 0
 
 
-def _loop(
-    program: Program,
-    records: Records,
-    state: TrainState,
-    run_dir: Path,
-    checkpoints: Checkpoints,
-    *,
-    stop: Stop,
-    quiet: bool,
-    console: Console,
-    profile: tuple[int, int],
-) -> Result:
-    config, seeds = program.config.trainer, program.seeds
-    done, fault = _epochs(state), None
-    saved = done if checkpoints.steps() else -1
-    stopwatch = Stopwatch()
-    display = Display(
-        console,
-        stopwatch,
-        title=f"{program.config.env.name} on {_machine(config.devices)}, {_named(seeds)}",
-        total_env_steps=program.epochs * program.env_steps_per_epoch,
-        done_env_steps=done * program.env_steps_per_epoch,
-        quiet=quiet,
-    )
-
-    def save(epochs: int, state: TrainState) -> None:
-        records.journal.sync()  # a checkpoint that is there has its rows
-        checkpoints.save(epochs * program.env_steps_per_epoch, state, program.config, success=records.success or 0.0)
-
-    def epoch(state: TrainState) -> tuple[TrainState, list[dict[str, Any]]]:
-        state, metrics = program.epoch(state)
-        return state, of_epoch(metrics, seeds)
-
-    def evaluate(state: TrainState, done: int) -> Episode:
-        return jax.block_until_ready(program.evaluate(state, program.evaluation_keys(done)))
-
-    def asked() -> bool:
-        return devices.anywhere(stop())
-
-    stop.on_first = display.stop
-    spare: tuple[int, TrainState] | None = None  # (epochs, state) before what may take long
-    trace = Profile(run_dir / "profile", first=profile[0], epochs=profile[1], say=display.say, warn=display.warn)
-    history = records.look_back()
-    try:
-        with Sinks(run_dir, program.config, history, warn=display.warn, muted=not devices.first()) as others:
-            with display, trace:
-                while done < program.epochs and fault is None and not asked():
-                    trace.before(done)
-                    evaluated = (done + 1) % config.eval_every == 0 or done + 1 == program.epochs
-                    long = stopwatch.expected("epoch", *["evaluation"] * evaluated) > _LONG_S
-                    spare = (done, _copied(state)) if long and not stop.patient else None
-                    with stopwatch.measure("epoch"):
-                        state, table = stop.during(partial(epoch, state))
-                    speed = program.env_steps_per_epoch * len(seeds) / stopwatch.last("epoch")
-                    done += 1
-                    trace.after(done)
-                    env_steps = done * program.env_steps_per_epoch
-                    fault = faults.find(table, state, env_steps=env_steps)
-                    if evaluated and fault is None:
-                        with stopwatch.measure("evaluation"):
-                            evaluation.add_to(table, stop.during(partial(evaluate, state, done)))
-                        records.add_regions(state, env_steps=env_steps)
-                    records.add(table, env_steps=env_steps, speed=speed)
-                    others.write(table)
-                    display.update(env_steps, table, left_s=stopwatch.left(_left(program, done)))
-                    if fault is None and (done % config.checkpoint_every == 0 or done == program.epochs):
-                        with stopwatch.measure("checkpoint"):
-                            save(done, state)
-                        saved = done
-                interrupted = asked() if fault else done < program.epochs
-                if fault is None and saved != done:
-                    save(done, state)
-            env_steps = done * program.env_steps_per_epoch
-            regions = records.regions(state if fault is None else None, env_steps=env_steps)
-            if devices.first():
-                _draw(run_dir / "figures", program, rows=records.journal.metrics.read(), regions=regions)
-            others.figures(run_dir / "figures")
-    except Overdue:
-        done = max(saved, 0)  # where it is, if what is short took long for once
-        if spare is not None and spare[0] > saved:
-            save(*spare)
-            done = spare[0]
-        return Result(run_dir, done * program.env_steps_per_epoch, True, records.success, terminated=True)
-    steps = checkpoints.steps()
-    return Result(
-        run_dir,
-        env_steps,
-        interrupted,
-        records.success,
-        terminated=interrupted and devices.anywhere(stop.terminated),
-        fault=fault,
-        saved=steps[-1] if steps else None,
-    )
-
-
-def _copied(state: TrainState) -> TrainState:
-    """A copy of `state` on the host: an epoch uses up what it is given."""
-    return jax.tree.map(np.array, checkpoint.plain(state))
-
-
-def _draw(folder: Path, program: Program, *, rows: list[dict[str, Any]], regions: list[dict[str, Any]]) -> None:
-    walls = program.walls
-    try:
-        report.summary_figure(folder / "summary.png", regions=regions, rows=rows, walls=walls)
-        if regions:
-            report.growth_figure(folder / "growth.png", regions=regions, walls=walls)
-        if rows and program.config.sgim.enabled:
-            report.sgim_figure(folder / "sgim.png", regions=regions, rows=rows, walls=walls)
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be written: {error.strerror}; the run itself is saved") from None
-
-
 def _epochs(state: TrainState) -> int:
     """How many are over."""
     return int(jax.device_get(state.epoch)[0])
-
-
-def _machine(count: int) -> str:
-    return (f"{count} x " if count > 1 else "") + jax.default_backend()
-
-
-def _named(seeds: list[int]) -> str:
-    return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {seeds[0]} to {seeds[-1]}"
-
-
-def _left(program: Program, done: int) -> dict[str, int]:
-    """How many epochs, evaluations and checkpoints follow after `done` epochs; the last epoch has both."""
-
-    def count(every: int) -> int:
-        return -(-program.epochs // every) - done // every if done < program.epochs else 0
-
-    config = program.config.trainer
-    return {
-        "epoch": program.epochs - done,
-        "evaluation": count(config.eval_every),
-        "checkpoint": count(config.checkpoint_every),
-    }
 
 
 def _traced(program: Program, checkpoints: Checkpoints, epochs: int) -> int:

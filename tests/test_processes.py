@@ -56,7 +56,13 @@ def test_several_gpus_with_warp_need_a_process_each(two_gpus, monkeypatch):
 
 @pytest.mark.parametrize(
     "settings",
-    [{"trainer.devices": 1}, {"trainer.device": "cpu"}, {"env.engine": "jax"}, {"env.name": "point_maze"}],
+    [
+        {"trainer.devices": 1},
+        {"trainer.device": "cpu"},
+        {"env.engine": "jax"},
+        {"env.name": "point_maze"},
+        {"env.name": "unheard_of"},  # refused later
+    ],
 )
 def test_all_else_is_done_by_one_process(two_gpus, settings):
     assert processes.gpus(config(**settings)) == []

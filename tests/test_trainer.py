@@ -22,7 +22,7 @@ import pytest
 import yaml
 
 import envs
-from star import checkpoint, cli, provenance, report, starting, stopping, trainer
+from star import checkpoint, cli, provenance, report, starting, stopping, stretch, trainer
 from star import program as programs
 from star.checkpoint import Checkpoints, check_compatible
 from star.config import ConfigError
@@ -199,7 +199,7 @@ def test_an_epoch_too_long_for_sigterm_is_given_up_and_the_one_before_it_saved(f
     part, over = tmp_path / "part", threading.Event()
     with monkeypatch.context() as patch:
         patch.setattr(stopping, "GRACE_S", 0.0)
-        patch.setattr(trainer, "_LONG_S", 0.0)
+        patch.setattr(stretch, "_LONG_S", 0.0)
         interrupt_after(patch, epochs=4, number=signal.SIGTERM, then=over.wait)
         result = trainer.train(tiny(), part, quiet=True)
         over.set()
