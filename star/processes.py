@@ -26,7 +26,7 @@ from star.config import Config
 
 GRACE_S = 10.0  # how long the others may go on when one has failed
 _GOOD = (0, 3, 130)  # ends that all processes come to together
-_LOOK = "import jax, envs.physics; print(envs.physics.resolve('auto'), len(jax.devices()))"
+_LOOK = "import jax, envs.physics; print(envs.physics.resolve_engine('auto'), len(jax.devices()))"
 
 
 def gpus(config: Config) -> list[str]:
@@ -38,14 +38,22 @@ def gpus(config: Config) -> list[str]:
     warp = config.env.engine in ("auto", "warp") and task is not None and "warp" in task.engines
     if count == 1 or config.trainer.device == "cpu" or not warp or importlib.util.find_spec("warp") is None:
         return []
-    # in a process of its own, for one that has looked at the GPUs takes memory of all of them
-    seen = subprocess.run([sys.executable, "-c", _LOOK], stdout=subprocess.PIPE, text=True, check=False).stdout.split()
-    if seen[:1] != ["warp"]:
+    engine, there = look()
+    if engine != "warp":
         return []
     names = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
-    names = names or [str(number) for number in range(int(seen[1]))]
+    names = names or [str(number) for number in range(there)]
     devices.check_count(count, len(names), "gpu")
     return names[:count]
+
+
+def look() -> tuple[str, int]:
+    """The engine that `auto` is here, and the number of devices, by a process of its own.
+
+    For one that has looked at the GPUs takes memory of all of them.
+    """
+    seen = subprocess.run([sys.executable, "-c", _LOOK], capture_output=True, text=True, check=False).stdout.split()
+    return (seen[0], int(seen[1])) if seen else ("", 0)
 
 
 def run(command: Sequence[str], gpus: Sequence[str]) -> int:

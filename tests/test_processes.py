@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -34,8 +33,11 @@ def two_gpus(monkeypatch):
     """A machine with MJX-Warp and two GPUs."""
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr(processes.importlib.util, "find_spec", lambda name: name == "warp" or None)
-    seen = subprocess.CompletedProcess([], 0, stdout="warp 2\n")
-    monkeypatch.setattr(processes.subprocess, "run", lambda *_, **__: seen)
+    monkeypatch.setattr(processes, "look", lambda: ("warp", 2))
+
+
+def test_what_is_here_is_seen_from_a_process_of_its_own():
+    assert processes.look() == ("native", 1)
 
 
 def config(**settings):
