@@ -495,7 +495,7 @@ def _judged(case: Case, folder: Path) -> tuple[str, str]:
     if code not in (0, 3):
         return f"exit code {code}", said
     new = [path for path in folder.iterdir() if path.name not in case.files]
-    if ["--resume", "."] in [list(pair) for pair in itertools.pairwise(case.arguments)]:
+    if ("--resume", ".") in itertools.pairwise(case.arguments):
         new = [folder]  # what it holds could be a run that was interrupted before its first checkpoint
     written = [file.read_text().count("\n") for path in new for file in path.rglob("metrics.jsonl")]
     if not (len(new) == 1 and written and written[0]):

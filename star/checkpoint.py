@@ -36,7 +36,7 @@ from star.config import Config, ConfigError
 from star.loading import fields, parse
 from star.migrations import FORMAT, About, Arrays, migrated, migrated_arrays, readable
 from star.program import Program
-from star.state import TrainState
+from star.state import TrainState, leaf_name
 
 SUMS = "SHA256SUMS"
 _ABOUT = "about.json"
@@ -181,7 +181,7 @@ class Checkpoints:
         saved = self._open().metadata(path.absolute() / "state").item_metadata.tree
         template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), saved)
         leaves, _ = jax.tree_util.tree_flatten_with_path(self._read(path, template))
-        return {_name(place): np.asarray(leaf) for place, leaf in leaves}
+        return {leaf_name(place): np.asarray(leaf) for place, leaf in leaves}
 
     def close(self) -> None:
         """Release orbax's threads."""
@@ -244,12 +244,6 @@ class Checkpoints:
         for entry in self._path.iterdir():
             if entry.name.startswith(".") and entry.name.endswith((_WRITING, _LEAVING)):
                 shutil.rmtree(entry)
-
-
-def _give_memory_back() -> None:
-    """What the many threads that write have freed, glibc keeps for each: on 32 cores 20 MiB more every time."""
-    with contextlib.suppress(OSError, AttributeError):  # another C library
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def best(successes: Mapping[int, float]) -> int:
@@ -399,6 +393,12 @@ def _sums(path: Path) -> str:
     return "".join(lines)
 
 
+def _give_memory_back() -> None:
+    """What the many threads that write have freed, glibc keeps for each: on 32 cores 20 MiB more every time."""
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
 def _cause(error: Exception) -> str:
     """Why something could not be read or written, in a few words; libraries hide the system's in their own."""
     if isinstance(error, OSError) and error.strerror:
@@ -407,20 +407,18 @@ def _cause(error: Exception) -> str:
     return next((text for text in known if text in str(error)), _reason(error))
 
 
-def _name(place: tuple[Any, ...]) -> str:
-    """That of a leaf, such as `tutor/optimizer/1/count`, the same in a `TrainState` and in what orbax reads without."""
-    return "/".join(str(getattr(key, "name", getattr(key, "key", getattr(key, "idx", key)))) for key in place)
-
-
 def _assembled(arrays: Arrays, template: Any) -> Any:
     """`arrays` in the structure of `template`, whose leaves give shape, type and sharding; raises `ValueError`."""
 
     def leaf(place: tuple[Any, ...], like: jax.ShapeDtypeStruct) -> jax.Array:
-        found = arrays.get(_name(place))
+        name = leaf_name(place)
+        found = arrays.get(name)
         if found is None:
-            raise ValueError(f"{_name(place)} is missing")
+            raise ValueError(f"{name} is missing")
         if (found.shape, found.dtype) != (like.shape, like.dtype):
-            raise ValueError(f"{_name(place)} is {found.dtype}{list(found.shape)}, not {like.dtype}{list(like.shape)}")
+            raise ValueError(
+                f"{leaf_name(place)} is {found.dtype}{list(found.shape)}, not {like.dtype}{list(like.shape)}"
+            )
         return jax.device_put(found, like.sharding)
 
     return jax.tree_util.tree_map_with_path(leaf, template)

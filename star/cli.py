@@ -20,7 +20,7 @@ from star.loading import fields, load, parse
 from star.stopping import leave
 
 if TYPE_CHECKING:
-    from star.trainer import Result
+    from star.stretch import Result
 
 _HELP = """\
 Train a three-level agent (Commander, Tutor, Controller) whose goal regions refine themselves.

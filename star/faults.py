@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from star.state import TrainState
+from star.state import TrainState, leaf_name
 
 Row = Mapping[str, Any]
 Tree = TypeVar("Tree")
@@ -82,7 +82,7 @@ def slower(tree: Tree, factors: Sequence[float]) -> Tree:
     by = jnp.asarray(factors, jnp.float32)
 
     def scaled(path: Any, leaf: Any) -> Any:
-        return leaf * by if _name(path).endswith(_RATE) else leaf
+        return leaf * by if leaf_name(path).endswith(_RATE) else leaf
 
     return jax.tree_util.tree_map_with_path(scaled, tree)
 
@@ -95,12 +95,8 @@ def _per_tensor(state: TrainState) -> jax.Array:
 
 def _numbers(state: TrainState) -> list[tuple[str, jax.Array]]:
     """The tensors that have to be finite, with their names such as `controller/params/actor/params/Dense_0/bias`."""
-    named = [(_name(path), leaf) for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]]
+    named = [(leaf_name(path), leaf) for path, leaf in jax.tree_util.tree_flatten_with_path(state)[0]]
     return [(name, x) for name, x in named if jnp.issubdtype(x.dtype, jnp.floating) and name not in _UNKNOWN]
-
-
-def _name(path: Any) -> str:
-    return jax.tree_util.keystr(path, simple=True, separator="/")
 
 
 def _level(name: str) -> str:

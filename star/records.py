@@ -21,7 +21,7 @@ class Records:
         self._began = time.monotonic() - (rows[-1]["wall_s"] if rows else 0.0)
 
     def look_back(self) -> list[dict[str, Any]]:
-        """Take what is latest, and return all rows of metrics, from the journal, which may have been cut."""
+        """Take what is latest from the journal, which may have been cut; returns its rows of metrics."""
         self.success: float | None = None
         """Mean `eval/success_final` of the latest evaluation."""
         rows = self.journal.metrics.read()

@@ -133,3 +133,8 @@ def examples(config: AgentConfig, spec: Spec) -> tuple[Transition, Transition]:
             **rest,
         ),
     )
+
+
+def leaf_name(path: tuple[Any, ...]) -> str:
+    """That of a leaf, such as `tutor/optimizer/1/count`, the same in a `TrainState` and in what orbax reads without."""
+    return jax.tree_util.keystr(path, simple=True, separator="/")

@@ -81,7 +81,8 @@ class Stretch:
 
     def run(self, state: TrainState) -> Result:
         """Train from `state` to the end, to a signal, or until numbers are no longer finite."""
-        program, history, muted = self._program, self._records.look_back(), not devices.first()
+        program, muted = self._program, not devices.first()
+        history = self._records.journal.metrics.read() if program.config.trainer.sinks else []
         self._stop.on_first = self._display.stop
         try:
             with Sinks(self._run_dir, program.config, history, warn=self._display.warn, muted=muted) as others:
