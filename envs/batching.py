@@ -19,7 +19,7 @@ def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
 
     A vmap over S calls it once with [S * n, ...], arguments that are not batched repeated, and returns [S, n, ...].
     """
-    inner = custom_vmap(function)
+    inner = custom_vmap(_without_empty_constants(function))
 
     @inner.def_vmap
     def rule(axis_size: int, in_batched: Any, *args: Any) -> tuple[Any, Any]:
@@ -37,15 +37,55 @@ def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
 def shared_out(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` of pytrees with a leading batch axis [n, ...], called by each device for its share of the batch.
 
-    Where the mesh of the context has no axis `AXIS` it is `function` itself. Else its size must divide n, and a vmap
-    over S around it makes [S, n / devices, ...] of the share, not of the whole. JAX's partitioner could not do it:
-    neither host callbacks nor kernels of Warp tell it how to cut them.
+    Its result must have the structure of its first argument, and be empty where that is. Where the mesh of the context
+    has no axis `AXIS` it is `function` itself. Else its size must divide n, and a vmap over S around it makes
+    [S, n / devices, ...] of the share, not of the whole. JAX's partitioner could not do it: neither host callbacks nor
+    kernels of Warp tell it how to cut them.
+
+    Arrays without elements stay outside, as do those that a `flattened` function holds: XLA takes them out of what
+    `jax.shard_map` is given before it cuts the program for GPUs, and crashes on what is left (jaxlib 0.11.2).
     """
+
+    def call(*args: Any) -> Any:
+        mesh = jax.sharding.get_abstract_mesh()
+        if AXIS not in mesh.axis_names:
+            return function(*args)
+
+        def on_share(*shares: Any) -> Any:
+            return _without_empty(function(*_with_empty(shares, args, mesh.shape[AXIS])))
+
+        share = PartitionSpec(AXIS)
+        shared = jax.shard_map(on_share, in_specs=share, out_specs=share, check_vma=False)
+        return _with_empty(shared(*_without_empty(args)), args[0], 1)
+
+    return call
+
+
+def _without_empty(tree: Any) -> Any:
+    """`tree` with None in place of arrays without elements."""
+    return jax.tree.map(lambda leaf: leaf if leaf.size else None, tree)
+
+
+def _with_empty(tree: Any, like: Any, parts: int) -> Any:
+    """`tree` with arrays in place of None, as in `like` but with a part of the leading axis."""
+
+    def fill(leaf: jax.Array | None, like: jax.Array | None) -> jax.Array | None:
+        if leaf is not None or like is None:
+            return leaf
+        return jnp.zeros((like.shape[0] // parts, *like.shape[1:]), like.dtype)
+
+    return jax.tree.map(fill, tree, like, is_leaf=lambda leaf: leaf is None)
+
+
+def _without_empty_constants(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, on a mesh with operations in place of the arrays without elements that it holds."""
 
     def call(*args: Any) -> Any:
         if AXIS not in jax.sharding.get_abstract_mesh().axis_names:
             return function(*args)
-        share = PartitionSpec(AXIS)
-        return jax.shard_map(function, in_specs=share, out_specs=share, check_vma=False)(*args)
+        traced, shape = jax.make_jaxpr(function, return_shape=True)(*args)
+        constants = [jnp.zeros(c.shape, c.dtype) if c.size == 0 else c for c in traced.consts]
+        leaves = jax.core.eval_jaxpr(traced.jaxpr, constants, *jax.tree.leaves(args))
+        return jax.tree.unflatten(jax.tree.structure(shape), leaves)
 
     return call
