@@ -1,8 +1,7 @@
 """A process for each GPU of this machine, where one process must not serve several of them.
 
-MJX-Warp starts its kernels from Python, one after another for all GPUs of a process, and crashed on two of them
-(mujoco-mjx 3.17.0, warp-lang 1.18.0). So a command that is to use several GPUs becomes the parent of one process for
-each, which work in step (`star.devices.join`).
+MJX-Warp starts its kernels from Python, one after another for all GPUs of a process. So a command that is to use
+several GPUs becomes the parent of one process for each, which work in step (`star.devices.join`).
 """
 
 from __future__ import annotations
