@@ -83,7 +83,10 @@ class Decision(struct.PyTreeNode):
 
 
 class Successors(struct.PyTreeNode):
-    """Which targets may follow a region: `greedy` for the best choice, `explore` for the random one."""
+    """Which targets may follow a region: `greedy` for the best choice, `explore` for the random one.
+
+    A goal's region may always follow itself.
+    """
 
     greedy: Bool[Array, "R R"]
     explore: Bool[Array, "R R"]
@@ -107,9 +110,9 @@ def successors(
 ) -> Successors:
     """Targets allowed from each region by what is known of reachability.
 
-    Random choices leave out the targets shown unreachable. Greedy ones are made among all targets (`any`), among
-    those not shown unreachable (`possible`), or among those shown reachable, if there are any (`known`, published).
-    A region may always be its own target. With `all` nothing is left out.
+    Random choices leave out the targets shown unreachable. Greedy ones are made among all targets (`any`) or among
+    those not shown unreachable (`possible`). A region may always be its own target. With `known`, as published, both
+    are made among those shown reachable, if there are any. With `all` nothing is left out.
     """
     pairs = active[:, None] & active[None, :]
     own = jnp.eye(active.shape[0], dtype=bool)
@@ -119,8 +122,8 @@ def successors(
     if mode != "known":
         return Successors(greedy=pairs if mode == "any" else possible, explore=possible)
     known = pairs & reaches & ~own
-    has_known = known.any(axis=1, keepdims=True)
-    return Successors(greedy=jnp.where(has_known, known | (own & pairs), possible), explore=possible)
+    chosen = jnp.where(known.any(axis=1, keepdims=True), known, possible)
+    return Successors(greedy=chosen, explore=chosen)
 
 
 def epsilon(config: CommanderConfig, env_steps: Float[Array, ""]) -> Float[Array, ""]:
@@ -165,13 +168,13 @@ def act(
     if practised is not None:
         reach = state.q if state.model is None else state.model.reach
         values = jnp.where((practised >= 0)[:, None], reach[region, practised], values)
-    best = jnp.where(allowed.greedy[region], values, -jnp.inf)
+    best = jnp.where(_options(allowed.greedy)[region, goal_region], values, -jnp.inf)
     ties = best >= best.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best.shape), -1.0), axis=-1)
     luck = jax.random.uniform(random_key, best.shape)
     if attraction is not None:  # the largest of u^(1/w) is the one with the weight w in proportion to w
         luck **= 1 / jnp.maximum(attraction, 1e-6)
-    anything = jnp.where(allowed.explore[region], luck, -1.0)
+    anything = jnp.where(_options(allowed.explore)[region, goal_region], luck, -1.0)
     exploring = jax.random.uniform(explore_key, region.shape) < epsilon
     return jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
 
@@ -344,10 +347,16 @@ def towards(
     state: CommanderState, allowed: Successors, goal_region: Int[Array, ""]
 ) -> tuple[Float[Array, "R"], Int[Array, "R"]]:
     """For g* in `goal_region`: the value of every region, and the target that is best there, the first of equals."""
-    values = jnp.where(allowed.greedy, state.q[:, goal_region], -jnp.inf)
+    values = jnp.where(_options(allowed.greedy)[:, goal_region], state.q[:, goal_region], -jnp.inf)
     return _best(state.q, allowed.greedy)[:, goal_region], jnp.argmax(values, axis=-1)
 
 
 def _best(q: Float[Array, "R R R"], allowed: Bool[Array, "R R"]) -> Float[Array, "R R"]:
     """Value of every region and goal region; 0 for regions that are not in use."""
-    return jnp.where(allowed.any(axis=1)[:, None], jnp.where(allowed[:, None], q, -jnp.inf).max(axis=-1), 0.0)
+    return jnp.where(allowed.any(axis=1)[:, None], jnp.where(_options(allowed), q, -jnp.inf).max(axis=-1), 0.0)
+
+
+def _options(allowed: Bool[Array, "R R"]) -> Bool[Array, "R R R"]:
+    """Targets that may follow every region, by the goal's region."""
+    own = jnp.eye(allowed.shape[0], dtype=bool)
+    return allowed[:, None, :] | (own[:, :, None] & own[:, None, :])

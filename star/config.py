@@ -164,14 +164,17 @@ class CommanderConfig(Section):
     epsilon_spread: bool = Field(
         True, description="spread epsilon over the environments, from none to twice as much, instead of the same in all"
     )
-    hold: bool = Field(True, description="command the goal wherever it counts as reached, whatever the table says")
+    hold: bool | Literal["region"] = Field(
+        True,
+        description="command the goal wherever it counts as reached (true) or all over its region (region)",
+    )
     practice: float = Field(
         0.25, ge=0, le=1, description="share of environments that practise reaching random regions, one after another"
     )
     successors: Literal["all", "any", "possible", "known"] = Field(
         "any",
-        description="greedy choice among all targets, those not shown unreachable, or the known-reachable ones; "
-        "all disregards reachability in random choices and plans too",
+        description="greedy choice among all targets, those not shown unreachable, or the known-reachable ones, which "
+        "known keeps to in random choices too; all disregards reachability in those and in plans",
     )
     reward: Literal["success", "mean", "max"] = Field(
         "success",
@@ -310,7 +313,9 @@ class RefinementConfig(Section):
     pairs_per_epoch: Repeats = Field(16, description="pairs examined after each epoch")
     cuts: Literal["best", "random"] = Field("best", description="where a region is cut; random is for comparison")
     cuts_per_pair: Repeats = Field(1, description="cuts one examined pair may make")
-    miss_lifetime: Positive = Field(2, description="epochs after which a MISSES verdict is forgotten")
+    miss_lifetime: Annotated[int, Field(ge=0, lt=2**31)] = Field(
+        2, description="epochs after which a MISSES verdict is forgotten; with 0 there is none"
+    )
 
 
 class SelectionConfig(Section):

@@ -201,8 +201,8 @@ def command(
             key=act_key,
         )
         if config.commander.hold:
-            there = (streams.env.metrics["success"] > 0) & (practice < 0)
-            target = jnp.where(there, goal_region, target)
+            there = region == goal_region if config.commander.hold == "region" else streams.env.metrics["success"] > 0
+            target = jnp.where(there & (practice < 0), goal_region, target)
     to_point = jnp.zeros_like(practice, bool)
     if config.commander.enabled and lesson is not None:
         lesson, waypoint, to_point = strategies.impose(config.sgim, lesson, spec.abstract(obs))

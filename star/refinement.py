@@ -257,7 +257,8 @@ def refine(
             cuttable &= inside | regions.adjacent(abstraction)[region, target]
         abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, cuttable, key=cut_key)
         verdict = jnp.where(mixed & ~splits.done.any() & reachability.reaches_where_visited(leaves), REACHES, verdict)
-        settled = judged & ~inside & ((verdict == REACHES) | (verdict == MISSES))
+        recorded = (verdict == REACHES) | ((verdict == MISSES) & (config.refinement.miss_lifetime > 0))
+        settled = judged & ~inside & recorded
         known = jnp.where(settled, verdict, graph.verdict[region, target])
         graph = graph.replace(verdict=graph.verdict.at[region, target].set(known))
         return (abstraction, graph), (splits, found, mixed)

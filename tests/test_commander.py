@@ -215,12 +215,9 @@ def slow_successors(mode, reaches, misses, active):
             if active[i] and active[j]:
                 explore[i, j] = i == j or not misses[i, j]
                 known = [k for k in range(R) if active[k] and reaches[i, k] and k != i]
-                if mode == "any":
-                    greedy[i, j] = True
-                elif mode == "known" and known:
-                    greedy[i, j] = j in known or i == j
-                else:
-                    greedy[i, j] = explore[i, j]
+                if mode == "known" and known:
+                    explore[i, j] = j in known
+                greedy[i, j] = mode == "any" or explore[i, j]
     return greedy, explore
 
 
@@ -234,9 +231,22 @@ def test_successors_by_mode(mode):
 
 def test_known_falls_back_to_what_is_possible_where_nothing_is_known():
     got = commander.successors("known", reaches=jnp.array(REACHES), misses=jnp.array(MISSES), active=jnp.array(ACTIVE))
-    assert got.greedy[0].tolist() == [True, True, False, False, False]
+    assert got.greedy[0].tolist() == [False, True, False, False, False]
     assert got.greedy[1].tolist() == [True, True, False, True, False]
     assert got.greedy[3].tolist() == [True, True, True, True, False]
+
+
+def test_a_goals_region_may_always_follow_itself():
+    """Though others are known to be reachable from there, for choices and for what is to come."""
+    known = jnp.zeros((R, R), bool).at[:, 1].set(True)
+    allowed = Successors(greedy=known, explore=known)
+    state = CommanderState(q=jnp.zeros((R, R, R)).at[..., 0].set(1.0), chosen=jnp.zeros(R))
+    many, key = jnp.zeros(300, jnp.int32), jax.random.key(0)
+    for there, greedy, random in ((many, {0}, {0, 1}), (many + 2, {1}, {1})):
+        assert set(commander.act(state, allowed, many, there, epsilon=0.0, key=key).tolist()) == greedy
+        assert set(commander.act(state, allowed, many, there, epsilon=1.0, key=key).tolist()) == random
+    values, targets = commander.towards(state, allowed, jnp.int32(0))
+    assert values.tolist() == [1.0, *[0.0] * (R - 1)] and targets.tolist() == [0, *[1] * (R - 1)]
 
 
 def test_the_greedy_choice_is_the_best_allowed_target_and_ties_break_at_random():

@@ -296,6 +296,13 @@ def test_the_parts_get_verdicts_and_a_miss_is_examined_again_after_its_lifetime(
     ]
 
 
+def test_misses_without_a_lifetime_are_not_recorded(refine, moving):
+    config, model, graph = settings(**{"refinement.miss_lifetime": 0}), moving((-6, 0)), knowing((0, 2))
+    assert int(refine(CONFIG, grid(), graph, model)[1].verdict[0, 2]) == MISSES
+    _, graph, _, metrics = refine(config, grid(), graph, model)
+    assert int(metrics["examined"]) == 1 and int(graph.verdict[0, 2]) == UNKNOWN
+
+
 @pytest.mark.parametrize(("quantity", "much"), [("transitions", 500.0), ("age", 5)])
 def test_first_comes_the_pair_commanded_most_or_that_has_waited_longest(refine, moving, quantity, much):
     graph = knowing((0, 2), (1, 3))
