@@ -168,13 +168,13 @@ def act(
     if practised is not None:
         reach = state.q if state.model is None else state.model.reach
         values = jnp.where((practised >= 0)[:, None], reach[region, practised], values)
-    best = jnp.where(_options(allowed.greedy)[region, goal_region], values, -jnp.inf)
+    best = jnp.where(_targets(allowed.greedy, region, goal_region), values, -jnp.inf)
     ties = best >= best.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best.shape), -1.0), axis=-1)
     luck = jax.random.uniform(random_key, best.shape)
     if attraction is not None:  # the largest of u^(1/w) is the one with the weight w in proportion to w
         luck **= 1 / jnp.maximum(attraction, 1e-6)
-    anything = jnp.where(_options(allowed.explore)[region, goal_region], luck, -1.0)
+    anything = jnp.where(_targets(allowed.explore, region, goal_region), luck, -1.0)
     exploring = jax.random.uniform(explore_key, region.shape) < epsilon
     return jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
 
@@ -347,16 +347,20 @@ def towards(
     state: CommanderState, allowed: Successors, goal_region: Int[Array, ""]
 ) -> tuple[Float[Array, "R"], Int[Array, "R"]]:
     """For g* in `goal_region`: the value of every region, and the target that is best there, the first of equals."""
-    values = jnp.where(_options(allowed.greedy)[:, goal_region], state.q[:, goal_region], -jnp.inf)
+    possible = _targets(allowed.greedy, jnp.arange(state.chosen.shape[0]), goal_region)
+    values = jnp.where(possible, state.q[:, goal_region], -jnp.inf)
     return _best(state.q, allowed.greedy)[:, goal_region], jnp.argmax(values, axis=-1)
 
 
 def _best(q: Float[Array, "R R R"], allowed: Bool[Array, "R R"]) -> Float[Array, "R R"]:
     """Value of every region and goal region; 0 for regions that are not in use."""
-    return jnp.where(allowed.any(axis=1)[:, None], jnp.where(_options(allowed), q, -jnp.inf).max(axis=-1), 0.0)
+    own = jnp.arange(q.shape[0])
+    best = jnp.where(allowed[:, None], q, -jnp.inf).max(axis=-1)
+    best = best.at[own, own].max(q[own, own, own])
+    return jnp.where(allowed.any(axis=1)[:, None], best, 0.0)
 
 
-def _options(allowed: Bool[Array, "R R"]) -> Bool[Array, "R R R"]:
-    """Targets that may follow every region, by the goal's region."""
-    own = jnp.eye(allowed.shape[0], dtype=bool)
-    return allowed[:, None, :] | (own[:, :, None] & own[:, None, :])
+def _targets(allowed: Bool[Array, "R R"], region: Int[Array, "n"], goal_region: Int[Array, "*n"]) -> Bool[Array, "n R"]:
+    """What may follow each `region`, if the goal is in `goal_region`."""
+    home = jax.nn.one_hot(region, allowed.shape[0], dtype=bool)
+    return allowed[region] | (home & (region == goal_region)[:, None])
