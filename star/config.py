@@ -164,7 +164,7 @@ class CommanderConfig(Section):
     epsilon_spread: bool = Field(
         True, description="spread epsilon over the environments, from none to twice as much, instead of the same in all"
     )
-    hold: bool | Literal["region"] = Field(
+    hold: Literal[False, True, "region"] = Field(
         True,
         description="command the goal wherever it counts as reached (true) or all over its region (region)",
     )
