@@ -42,8 +42,9 @@ def shared_out(function: Callable[..., Any]) -> Callable[..., Any]:
     [S, n / devices, ...] of the share, not of the whole. JAX's partitioner could not do it: neither host callbacks nor
     kernels of Warp tell it how to cut them.
 
-    Arrays without elements stay outside, as do those that a `flattened` function holds: XLA takes them out of what
-    `jax.shard_map` is given before it cuts the program for GPUs, and crashes on what is left (jaxlib 0.11.2).
+    Arrays without elements stay outside, as do those that a `flattened` function holds (but not functions jitted within
+    it): XLA takes them out of what `jax.shard_map` is given before it cuts the program for GPUs, and crashes on what is
+    left (jaxlib 0.11.2).
     """
 
     def call(*args: Any) -> Any:
@@ -52,13 +53,20 @@ def shared_out(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(*args)
 
         def on_share(*shares: Any) -> Any:
-            return _without_empty(function(*_with_empty(shares, args, mesh.shape[AXIS])))
+            whole = _with_empty(shares, args, mesh.shape[AXIS])
+            result = function(*whole)
+            jax.tree.map(_check_empty, result, whole[0])
+            return _without_empty(result)
 
         share = PartitionSpec(AXIS)
         shared = jax.shard_map(on_share, in_specs=share, out_specs=share, check_vma=False)
         return _with_empty(shared(*_without_empty(args)), args[0], 1)
 
     return call
+
+
+def _check_empty(leaf: jax.Array, like: jax.Array) -> None:
+    assert leaf.size or (leaf.shape, leaf.dtype) == (like.shape, like.dtype), "an empty result is unlike the argument"
 
 
 def _without_empty(tree: Any) -> Any:

@@ -85,7 +85,7 @@ class Decision(struct.PyTreeNode):
 class Successors(struct.PyTreeNode):
     """Which targets may follow a region: `greedy` for the best choice, `explore` for the random one.
 
-    A goal's region may always follow itself.
+    Besides, the region of a goal, or one that is practised, may always follow itself.
     """
 
     greedy: Bool[Array, "R R"]
@@ -111,8 +111,8 @@ def successors(
     """Targets allowed from each region by what is known of reachability.
 
     Random choices leave out the targets shown unreachable. Greedy ones are made among all targets (`any`) or among
-    those not shown unreachable (`possible`). A region may always be its own target. With `known`, as published, both
-    are made among those shown reachable, if there are any. With `all` nothing is left out.
+    those not shown unreachable (`possible`). A region may be its own target. With `known`, as published, both are made
+    among others shown reachable, if there are any. With `all` nothing is left out.
     """
     pairs = active[:, None] & active[None, :]
     own = jnp.eye(active.shape[0], dtype=bool)
@@ -168,13 +168,14 @@ def act(
     if practised is not None:
         reach = state.q if state.model is None else state.model.reach
         values = jnp.where((practised >= 0)[:, None], reach[region, practised], values)
-    best = jnp.where(_targets(allowed.greedy, region, goal_region), values, -jnp.inf)
+    pursued = goal_region if practised is None else jnp.where(practised >= 0, practised, goal_region)
+    best = jnp.where(_targets(allowed.greedy, region, pursued), values, -jnp.inf)
     ties = best >= best.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best.shape), -1.0), axis=-1)
     luck = jax.random.uniform(random_key, best.shape)
     if attraction is not None:  # the largest of u^(1/w) is the one with the weight w in proportion to w
         luck **= 1 / jnp.maximum(attraction, 1e-6)
-    anything = jnp.where(_targets(allowed.explore, region, goal_region), luck, -1.0)
+    anything = jnp.where(_targets(allowed.explore, region, pursued), luck, -1.0)
     exploring = jax.random.uniform(explore_key, region.shape) < epsilon
     return jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
 

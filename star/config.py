@@ -166,7 +166,7 @@ class CommanderConfig(Section):
     )
     hold: Literal[False, True, "region"] = Field(
         True,
-        description="command the goal wherever it counts as reached (true) or all over its region (region)",
+        description="command the goal wherever it counts as reached (true), or instead all over its region (region)",
     )
     practice: float = Field(
         0.25, ge=0, le=1, description="share of environments that practise reaching random regions, one after another"

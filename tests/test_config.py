@@ -399,3 +399,10 @@ def test_a_number_that_float32_cannot_hold_is_refused():
     with pytest.raises(ConfigError, match=r": tutor.reward_scale: 1e\+300 is not allowed: should lie between"):
         parse({}, {"tutor.reward_scale": 1e300})
     assert parse({}, {"tutor.reward_scale": 1e38}).tutor.reward_scale == 1e38
+
+
+def test_hold_has_three_values():
+    for value in (False, True, "region"):
+        assert parse({}, {"commander.hold": value}).commander.hold is value
+    with pytest.raises(ConfigError, match=r"commander.hold: 'goal' is not allowed: should be False, True or 'region'$"):
+        parse({}, {"commander.hold": "goal"})

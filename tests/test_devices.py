@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 
 REPLAY = """
 import jax, jax.numpy as jnp, numpy as np
+from envs.batching import flattened, shared_out
 from star import devices, td3
 from star.config import TD3Config
 from star.replay import Transition
@@ -44,6 +45,17 @@ def learn(mesh):
 one, four = learn(None), learn(devices.mesh(4))
 assert four.ring.experience.obs.addressable_shards[0].data.shape == (1, 16, 3)
 jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), one, jax.device_get(four))
+
+@flattened
+def walk(state):
+    at, none = state
+    assert at.shape == (2, 1) and none.shape == (2, 0), "a share of each"
+    return at + 1, none
+
+mesh = devices.mesh(4)
+steps = jax.jit(devices.on(mesh, jax.vmap(shared_out(walk))), out_shardings=devices.everywhere(mesh))
+at, none = steps((jnp.zeros((1, 8, 1)), jnp.zeros((1, 8, 0))))
+assert (at == 1).all() and none.shape == (1, 8, 0)
 
 drifted = jax.make_array_from_single_device_arrays(
     (2,), devices.everywhere(devices.mesh(4)), [jax.device_put(jnp.full(2, float(i)), d) for i, d in

@@ -1,6 +1,7 @@
 import dataclasses
 import itertools
 import json
+import operator
 import re
 import shlex
 import shutil
@@ -16,7 +17,7 @@ from star import assessment, cli, record, rendering, sweep, tables, trainer
 from star import program as programs
 from star.cli import main
 from star.config import Config
-from star.loading import fields, parse
+from star.loading import fields, load, parse
 
 ENDLESS = {"total_env_steps": 2**62}
 ROOT = Path(__file__).parents[1]
@@ -207,6 +208,22 @@ def test_departures_name_the_settings_and_their_defaults():
             default = DEFAULTS[key]
         assert ours == f"`{json.dumps(default)}`", key
         assert published not in (ours, ""), key
+
+
+def test_the_papers_config_has_the_published_values():
+    paper = load(ROOT / "configs/paper/ant_maze.yaml")
+    other = {"forward_model.boxes", "refinement.min_transitions"}  # as departures.md says
+    seen = 0
+    for key, published, *_ in (row for row in rows("docs/departures.md") if len(row) == 4):
+        literal = re.match(r"`([^`]+)`", published)
+        if literal is None or key in other:
+            continue
+        options = key.startswith("env.options.")
+        value = paper.env.options[key.split(".")[-1]] if options else operator.attrgetter(key)(paper)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        assert (value == float(literal[1])) if number else (str(value).lower() == literal[1]), key
+        seen += 1
+    assert seen > 20
 
 
 @pytest.mark.parametrize(

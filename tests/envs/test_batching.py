@@ -63,6 +63,12 @@ def test_arrays_without_elements_are_not_shared_out(empty):
     assert all(array.size for array in seen)
 
 
+def test_an_empty_result_must_be_like_the_argument():
+    cut = shared_out(flattened(lambda state: (state[0][:, :0],)))
+    with pytest.raises(AssertionError, match="an empty result is unlike the argument"):
+        under_vmap(cut, (jnp.zeros((2, 3, 4)),))
+
+
 def test_environments_share_out_nothing_without_elements():
     env = envs.make("ant_maze", engine="native")
     batch = VectorEnv(env, 2, auto_reset=False)
