@@ -37,8 +37,8 @@ def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
 def shared_out(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` of pytrees with a leading batch axis [n, ...], called by each device for its share of the batch.
 
-    Its result must have the structure of its first argument, and be empty where that is. Where the mesh of the context
-    has no axis `AXIS` it is `function` itself. Else its size must divide n, and a vmap over S around it makes
+    Its result must have the structure of its first argument, and be empty only where that is. Where the mesh of the
+    context has no axis `AXIS` it is `function` itself. Else its size must divide n, and a vmap over S around it makes
     [S, n / devices, ...] of the share, not of the whole. JAX's partitioner could not do it: neither host callbacks nor
     kernels of Warp tell it how to cut them.
 

@@ -416,9 +416,7 @@ def _assembled(arrays: Arrays, template: Any) -> Any:
         if found is None:
             raise ValueError(f"{name} is missing")
         if (found.shape, found.dtype) != (like.shape, like.dtype):
-            raise ValueError(
-                f"{leaf_name(place)} is {found.dtype}{list(found.shape)}, not {like.dtype}{list(like.shape)}"
-            )
+            raise ValueError(f"{name} is {found.dtype}{list(found.shape)}, not {like.dtype}{list(like.shape)}")
         return jax.device_put(found, like.sharding)
 
     return jax.tree_util.tree_map_with_path(leaf, template)

@@ -28,7 +28,7 @@ def shared(jaxpr):
 
 
 def under_vmap(function, *args):
-    """`function` of arguments [S, n, ...], jitted as it is on a mesh of one device."""
+    """The operations of `function` under a vmap on a mesh of one device, for arguments [S, n, ...]."""
     with jax.sharding.use_abstract_mesh(mesh().abstract_mesh):
         return jax.make_jaxpr(jax.vmap(function))(*args)
 
