@@ -11,7 +11,7 @@ and seeds:
 
 `ratio` holds these speeds over those of one device, if 1 comes first. What keeps `epoch` below `acting` is learning:
 its messages between devices, and what every device does for itself. Each number of devices is measured in a process of
-its own, or where `star train` starts one for each GPU, in as many.
+its own.
 """
 
 from __future__ import annotations
@@ -29,9 +29,8 @@ from typing import Any
 import jax
 
 from envs.vector import VectorEnv
-from star import cli, devices, processes
+from star import cli, devices
 from star import program as programs
-from star.config import Config
 from star.loading import load
 from star.profiling import timed
 from star.program import Program
@@ -46,23 +45,18 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=3)
     parser.add_argument("--per-device-envs", type=int, default=4096)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)  # a process that measures writes its row there
-    parser.add_argument("--distributed", help=argparse.SUPPRESS)
     words, settings = cli.split_settings(sys.argv[1:])
     options = parser.parse_args(words)
     if options.out is not None:
-        if options.distributed:
-            devices.join(options.distributed)
         row = measure(options.config, options.devices[0], options.epochs, options.per_device_envs, settings)
-        if devices.first():
-            options.out.write_text(json.dumps(row), encoding="utf-8")
+        options.out.write_text(json.dumps(row), encoding="utf-8")
         return
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         for count in options.devices:
             out = Path(folder) / f"{count}.json"
             command = [sys.executable, __file__, *sys.argv[1:], "--devices", str(count), "--out", str(out)]
-            gpus = processes.gpus(sized(options.config, count, options.per_device_envs, settings))
-            code = processes.run(command, gpus) if gpus else subprocess.run(command, check=False).returncode
+            code = subprocess.run(command, check=False).returncode
             if code != 0:
                 sys.exit(code)
             rows.append(json.loads(out.read_text(encoding="utf-8")))
@@ -70,17 +64,11 @@ def main() -> None:
             print(json.dumps(rows[-1]), flush=True)
 
 
-def sized(path: Path, count: int, per_device: int, settings: dict[str, Any]) -> Config:
-    """The config for `count` devices."""
-    num_envs = count * per_device
-    sizes = {"trainer.devices": count, "trainer.num_envs": num_envs, "trainer.eval_episodes": num_envs}
-    return load(path, settings | sizes)
-
-
 def measure(path: Path, count: int, epochs: int, per_device: int, settings: dict[str, Any]) -> dict[str, Any]:
     """The row of `count` devices: medians of `epochs` epochs, episodes and loops after one that compiles."""
-    program = programs.build(sized(path, count, per_device, settings))
-    num_envs = program.config.trainer.num_envs
+    num_envs = count * per_device
+    sizes = {"trainer.devices": count, "trainer.num_envs": num_envs, "trainer.eval_episodes": num_envs}
+    program = programs.build(load(path, settings | sizes))
     steps = program.env_steps_per_epoch * len(program.seeds)
     state = program.init(program.seed_keys())
     first_s, (state, _) = timed(program.epoch, state)
@@ -94,7 +82,6 @@ def measure(path: Path, count: int, epochs: int, per_device: int, settings: dict
     epoch_s, loops = statistics.median(times), physics(program, epochs)
     return {
         "devices": count,
-        "processes": jax.process_count(),
         "task": program.config.env.name,
         "engine": program.config.env.engine,
         "num_envs": num_envs,

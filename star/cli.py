@@ -101,7 +101,6 @@ def _run(arguments: list[str]) -> int:
         parser.print_help()
         return 0
     flags = {name: _value(text) for name, text in vars(options).items() if "." in name and text is not None}
-    options.arguments = arguments
     return options.function(options, flags | overrides)
 
 
@@ -308,15 +307,12 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
         debugging.turn_on()
 
-    from star import devices, processes, trainer
+    from star import devices, trainer
 
     if options.distributed is not None:
         if options.resume is None and options.run_dir is None:
             raise ConfigError("--distributed: needs --run-dir, the same for all processes")
         devices.join(options.distributed)
-    elif gpus := processes.gpus(config):
-        where = [] if options.resume or options.run_dir else ["--run-dir", str(run_dir)]
-        return processes.run([sys.executable, "-m", "star.cli", *options.arguments, *where], gpus)
     result = trainer.train(
         config, run_dir, resume=options.resume is not None, quiet=options.quiet, profile=options.profile
     )

@@ -32,7 +32,11 @@ def mesh(count: int) -> Mesh | None:
     Several processes must use all their devices.
     """
     there, processes = jax.devices(), jax.process_count()
-    check_count(count, len(there), jax.default_backend())
+    if count > len(there):
+        raise ConfigError(
+            f"trainer.devices: {count} are not available, JAX sees {len(there)} ({jax.default_backend()}); "
+            f"allowed: {'1 to ' * (len(there) > 1)}{len(there)}"
+        )
     if processes > 1 and count != len(there):
         raise ConfigError(
             f"trainer.devices: {count}, but the {processes} processes have {len(there)} devices; allowed: {len(there)}"
@@ -40,15 +44,6 @@ def mesh(count: int) -> Mesh | None:
     if count == 1:
         return None
     return jax.make_mesh((count,), (AXIS,), axis_types=(AxisType.Auto,), devices=there[:count])
-
-
-def check_count(count: int, there: int, kind: str) -> None:
-    """Raise `ConfigError` if `count` devices are more than are `there`."""
-    if count > there:
-        raise ConfigError(
-            f"trainer.devices: {count} are not available, JAX sees {there} ({kind}); "
-            f"allowed: {'1 to ' * (there > 1)}{there}"
-        )
 
 
 def on(mesh: Mesh | None, function: Callable[..., Any]) -> Callable[..., Any]:

@@ -114,11 +114,6 @@ def build(config: Config) -> Program:
         raise ConfigError(str(error)) from None
     test_env = make_env(config, "test")
     mesh = devices.mesh(config.trainer.devices)
-    if env.engine == "warp" and mesh is not None and len(mesh.local_devices) > 1:
-        raise ConfigError(
-            f"trainer.devices: {config.trainer.devices} GPUs with MJX-Warp need a process each: "
-            "`star train` starts them, other programs are given --distributed"
-        )
     trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
     episodes = config.trainer.eval_episodes
     surplus = -episodes % config.trainer.devices  # each device plays as many

@@ -73,7 +73,6 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
     monkeypatch.setattr("star.debugging.turn_on", lambda: None)
     monkeypatch.setattr("star.devices.join", lambda cluster: None)
-    monkeypatch.setattr("star.processes.gpus", lambda config: [])
     monkeypatch.setattr(assessment, "evaluate", lambda targets, exam, **_: [])
     monkeypatch.setattr(assessment, "compare", lambda rows, groups: None)
     monkeypatch.setattr(tables, "show", lambda rows, comparison, **_: None)
