@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import shlex
 import sys
@@ -234,7 +235,14 @@ def _add_record(record: argparse.ArgumentParser) -> None:
 
 
 def _add_report(report: argparse.ArgumentParser) -> None:
-    report.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run directory")
+    report.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run directory")
+    report.add_argument(
+        "--group",
+        action="append",
+        default=[],
+        metavar="NAME=RUN,RUN",
+        help="runs that differ in their seeds alone, to be shown as one",
+    )
     report.add_argument("--out", type=Path, required=True, metavar="FILE", help=".html")
     report.add_argument("--force", action="store_true", help="replace an existing file")
     report.set_defaults(function=_report)
@@ -413,23 +421,29 @@ def _chosen(options: argparse.Namespace) -> tuple[list[tuple[Path, str]], dict[s
         return run
 
     single = list(dict.fromkeys(add(path) for path in options.runs))
-    groups: dict[str, list[Path]] = {}
-    for text in options.group:
-        name, equals, runs = text.partition("=")
-        if not (name and equals and all(runs.split(","))):
-            raise ConfigError(f"--group: {text!r} is not of the form NAME=RUN,RUN")
-        if name in groups:
-            raise ConfigError(f"--group: {name} is given twice")
-        groups[name] = list(dict.fromkeys(add(Path(run)) for run in runs.split(",")))
-        for other, members in groups.items():
-            for run in members:
-                if other != name and run in groups[name]:
-                    raise ConfigError(f"--group: {run} is both in {other} and in {name}")
+    groups = {name: list(dict.fromkeys(map(add, runs))) for name, runs in _groups(options.group).items()}
+    for name, other in itertools.combinations(groups, 2):
+        for run in groups[name]:
+            if run in groups[other]:
+                raise ConfigError(f"--group: {run} is both in {name} and in {other}")
     grouped = {run for runs in groups.values() for run in runs}
     for run in single:
         if run not in grouped:
             groups[str(run)] = [run]
     return chosen, groups
+
+
+def _groups(texts: Sequence[str]) -> dict[str, list[Path]]:
+    """The runs of each NAME=RUN,RUN."""
+    groups: dict[str, list[Path]] = {}
+    for text in texts:
+        name, equals, runs = text.partition("=")
+        if not (name and equals and all(runs.split(","))):
+            raise ConfigError(f"--group: {text!r} is not of the form NAME=RUN,RUN")
+        if name in groups:
+            raise ConfigError(f"--group: {name} is given twice")
+        groups[name] = [Path(run) for run in runs.split(",")]
+    return groups
 
 
 def _run_and_checkpoint(path: Path, wanted: str) -> tuple[Path, str]:
@@ -555,15 +569,19 @@ def _report(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         files.check(options.out, (".html",), force=options.force)
     except EnvError as error:
         raise ConfigError(str(error)) from None
+    groups = _groups(options.group)
+    chosen = [run for members in groups.values() for run in members] + options.runs
+    if not chosen:
+        raise ConfigError("star report: give a RUN, or --group NAME=RUN,RUN (see star report --help)")
     runs: dict[Path, Config] = {}
-    for run in options.runs:
+    for run in chosen:
         if run.resolve() in {other.resolve() for other in runs}:
             raise ConfigError(f"{run}: is given twice")
         runs[run] = _run_config(run, {})
 
     from star import page
 
-    print(page.write(runs, options.out))
+    print(page.write(runs, options.out, groups=groups))
     return 0
 
 

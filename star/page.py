@@ -1,6 +1,7 @@
 """The report: runs as one HTML page that needs no network and no other file.
 
     read      what a run left on disk
+    together  runs that differ in their seeds alone, as one
     content   what the page shows of it, as plain values: curves thinned and summarised, regions at some moments
     write     star/assets/report.html with its style, its script and these values as JSON in it
 
@@ -38,6 +39,7 @@ MAX_FILM = 1_500_000  # bytes of a film in the page
 Row = Mapping[str, Any]
 Kinds = Mapping[str, type | tuple[type, ...]]
 
+_OF_SEEDS = frozenset({"trainer.seed", "trainer.num_seeds"})
 _MARK = '<meta name="generator" content="star report">'
 _SMALL_FILM = ("--every", "5", "--fps", "10", "--height", "240")  # about 1 MB for an episode of 500 env steps
 _NUMBER = (int, float)
@@ -48,9 +50,12 @@ _PROVENANCE: Kinds = {"env_steps": int, "time": str, "device": str, "python": st
 
 @dataclass(frozen=True)
 class Run:
-    """What a run left on disk. `epochs` are the complete ones: a row for each seed, in the order of the seeds."""
+    """What a run, or several `together`, left on disk.
 
-    path: Path
+    `epochs` are the complete ones: a row for each seed, in the order of the seeds.
+    """
+
+    paths: tuple[Path, ...]
     name: str
     config: Config
     epochs: list[list[Row]]
@@ -68,26 +73,27 @@ class Run:
         return [rows for rows in self.epochs if all("eval/success_final" in row for row in rows)]
 
 
-def write(runs: Mapping[Path, Config], out: Path) -> str:
+def write(runs: Mapping[Path, Config], out: Path, *, groups: Mapping[str, Sequence[Path]] | None = None) -> str:
     """Write the report of `runs` (directory: configuration) to `out`; returns a line that says what was written.
 
-    An existing file is replaced.
+    Those of each of the `groups` are shown `together`, before the others. An existing file is replaced.
 
     Raises:
-      ConfigError: in one line, if a run or `out` cannot be used; nothing is written then.
+      ConfigError: in one line, if a run, a group or `out` cannot be used; nothing is written then.
     """
     programs.select_device("cpu")  # a GPU may be busy with one of the runs
     try:
-        found = [
-            read(path, config, name=name)
+        found = {
+            path: read(path, config, name=name)
             for (path, config), name in zip(runs.items(), report.labels(list(runs)), strict=True)
-        ]
-        page = html(content(found))
+        }
+        merged = [together(name, [found.pop(path) for path in paths]) for name, paths in (groups or {}).items()]
+        page = html(content([*merged, *found.values()]))
         with files.whole(out) as partial:
             partial.write_text(page, encoding="utf-8")
     except EnvError as error:
         raise ConfigError(str(error)) from None
-    return f"{out}: {len(found)} run{'s' * (len(found) > 1)}, {out.stat().st_size / 1e6:.1f} MB; open it in a browser"
+    return f"{out}: {len(runs)} run{'s' * (len(runs) > 1)}, {out.stat().st_size / 1e6:.1f} MB; open it in a browser"
 
 
 def read(run_dir: Path, config: Config, *, name: str) -> Run:
@@ -102,12 +108,43 @@ def read(run_dir: Path, config: Config, *, name: str) -> Run:
     if not epochs:
         raise ConfigError(f"{run_dir}: its metrics.jsonl holds no complete epoch, so there is nothing to show yet")
     return Run(
-        path=run_dir,
+        paths=(run_dir,),
         name=name,
         config=config,
         epochs=epochs,
         regions=[row for rows in _complete(_checked(journal.regions, _REGIONS), seeds) for row in rows],
         starts=_checked(journal.provenance, _PROVENANCE),
+    )
+
+
+def together(name: str, runs: Sequence[Run]) -> Run:
+    """The seeds of several runs as those of one, as far as all have come.
+
+    Raises:
+      ConfigError: in one line, if they differ in more than their seeds, or two have trained the same seed.
+    """
+    for run in runs[1:]:
+        differ = {row["key"] for row in differences([runs[0].config, run.config])} - _OF_SEEDS
+        if differ:
+            raise ConfigError(
+                f"--group: {name}: {runs[0].paths[0]} and {run.paths[0]} differ in {min(differ)}; "
+                f"allowed: the same settings but for {' and '.join(sorted(_OF_SEEDS))}"
+            )
+    seeds = [seed for run in runs for seed in run.seeds]
+    for seed in seeds:
+        if seeds.count(seed) > 1:
+            raise ConfigError(f"--group: {name}: seed {seed} is in several of its runs; allowed: once")
+    epochs = _complete([row for run in runs for epoch in run.epochs for row in epoch], len(seeds))
+    if not epochs:
+        raise ConfigError(f"--group: {name}: its runs have no epoch in common, so there is nothing to show yet")
+    reached = epochs[-1][0]["env_steps"]
+    return Run(
+        paths=tuple(path for run in runs for path in run.paths),
+        name=name,
+        config=runs[0].config,
+        epochs=epochs,
+        regions=[row for run in runs for row in run.regions if row["env_steps"] <= reached],
+        starts=[start for run in runs for start in run.starts],
     )
 
 
@@ -148,7 +185,7 @@ def _shown(run: Run, *, most: int) -> dict[str, Any]:
         "evaluations": evaluation_curves(run.evaluations),
         "epochs": epoch_curves(run.epochs),
         "map": growth(run, most=most) if run.regions else None,
-        "film": film(run.path),
+        "film": film(run.paths[0]),
         "config": run.config.to_yaml(),
     }
 
@@ -168,9 +205,11 @@ def facts(run: Run) -> dict[str, Any]:
         # the first epoch compiles
         "env_steps_per_s": float(np.median(_table(run.epochs[1:] or run.epochs, "env_steps_per_s")[0])),
         "regions": _short(regions.mean(axis=0))[0],
-        "path": str(run.path),
+        "path": ", ".join(map(str, run.paths)),
         "engine": run.config.env.engine,
-        "command": shlex.join(["star", "train", str(run.path / "config.yaml"), "--run-dir", f"{run.path}-again"]),
+        "command": " && ".join(
+            shlex.join(["star", "train", str(path / "config.yaml"), "--run-dir", f"{path}-again"]) for path in run.paths
+        ),
         "starts": run.starts,
     } | {name: _short(np.ravel(evaluation.mean_band(table))) or None for name, table in best.items()}
 

@@ -159,7 +159,7 @@ def refusal(capsys, folder, arguments):
         pytest.param("record runs/old --out old.npz", "old.npz: exists; replace it with --force", id="record over"),
         pytest.param("record runs/old --out a.npz --episodes 0", "from 1 to 10000", id="record no episode"),
         pytest.param("report runs/old", "required: --out", id="report into nothing"),
-        pytest.param("report --out a.html", "required: RUN", id="report nothing"),
+        pytest.param("report --out a.html", "star report: give a RUN, or --group", id="report nothing"),
         pytest.param("report runs/new --out a.html", "runs/new: is not a run directory", id="report a non-run"),
         pytest.param("report runs/old --out a.html", "runs/old: its metrics.jsonl holds no", id="report an empty run"),
         pytest.param("report runs/old runs/../runs/old --out a.html", "is given twice", id="report a run twice"),

@@ -55,7 +55,7 @@ def commands():
         lines = [line for block in blocks(page, "bash") for line in block.replace("\\\n", " ").splitlines()]
         for line in lines + [code for code in inline(text) if code not in ("star train", "star evaluate")]:
             if re.match(r"(star|make) \S", line):
-                yield page, shlex.split(line, comments=True)
+                yield page, shlex.split(line.replace("$SLURM_ARRAY_TASK_ID", "3"), comments=True)
 
 
 COMMANDS = [pytest.param(words, id=" ".join([page, *words])[:90]) for page, words in commands()]
@@ -78,7 +78,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(tables, "show", lambda rows, comparison, **_: None)
     monkeypatch.setattr(cli, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg
     monkeypatch.setattr(rendering, "render", lambda config, show, **_: "")
-    monkeypatch.setattr("star.page.write", lambda runs, out: "")
+    monkeypatch.setattr("star.page.write", lambda runs, out, **_: "")
     monkeypatch.setattr(sweep, "run", lambda found, out, **_: sweep.Summary([], True, {"trial": 0}))
     monkeypatch.setattr(record, "record", lambda config, run_dir, out, **_: "")
     return tmp_path

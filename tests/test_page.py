@@ -163,6 +163,64 @@ def test_runs_of_the_same_name_are_told_apart_by_their_paths(make):
     assert report.labels(paths) == [str(paths[0]), str(paths[1]), "c"]
 
 
+def alone(make, name, *seeds, **settings):
+    settings = {f"trainer.{key}": value for key, value in settings.items()} | {"trainer.seed": seeds[0]}
+    return make(name, seeds=seeds, settings=settings)
+
+
+def test_seeds_that_were_trained_one_by_one_are_shown_like_seeds_side_by_side(make, tmp_path):
+    apart = [read(alone(make, name, *seeds)) for name, seeds in (("b", [2]), ("a", [0, 1]))]
+    shown, expected = (
+        page.content([run])["runs"][0] for run in (page.together("all", apart), read(make(seeds=[0, 1, 2])))
+    )
+    for part in ("seeds", "evaluations", "epochs", "map"):
+        assert shown[part] == expected[part], part
+    assert shown["facts"]["path"] == f"{tmp_path / 'b'}, {tmp_path / 'a'}" and len(shown["facts"]["starts"]) == 2
+
+
+def test_together_runs_are_shown_as_far_as_all_have_come(make):
+    first = make("first", seeds=[0], rows=metrics(3, [0]))
+    both = page.together("both", [read(first), read(alone(make, "second", 1))])
+    assert [rows[0]["env_steps"] for rows in both.epochs] == [100, 200, 300]
+    assert {row["env_steps"] for row in both.regions} == {200}
+
+
+def test_groups_come_before_other_runs(make, tmp_path, capsys):
+    first, second, third = alone(make, "first", 0), alone(make, "second", 1), make("third")
+    out = tmp_path / "report.html"
+    assert main(["report", str(third), "--group", f"star={first},{second}", "--out", str(out)]) == 0
+    assert capsys.readouterr().out.startswith(f"{out}: 3 runs, ")
+    shown = json.loads(Parts(out.read_text()).scripts[0])["runs"]
+    assert [(run["name"], run["seeds"]) for run in shown] == [("star", [0, 1]), ("third", [0, 1])]
+
+
+@pytest.mark.parametrize(
+    ("groups", "said"),
+    [
+        (["both=first,longer"], "--group: both: first and longer differ in trainer.total_env_steps; allowed: the same"),
+        (["both=first,again"], "--group: both: seed 0 is in several of its runs; allowed: once"),
+        (["both=first,late"], "--group: both: its runs have no epoch in common, so there is nothing to show yet"),
+        (["both=first", "others=first"], "first: is given twice"),
+        (["both=first", "both=second"], "--group: both is given twice"),
+        (["both"], "--group: 'both' is not of the form NAME=RUN,RUN"),
+        ([], "star report: give a RUN, or --group NAME=RUN,RUN"),
+    ],
+)
+def test_what_cannot_be_shown_together_is_refused_in_one_line(make, tmp_path, monkeypatch, capsys, groups, said):
+    monkeypatch.chdir(tmp_path)
+    alone(make, "first", 0), alone(make, "second", 1), alone(make, "again", 0)
+    alone(make, "longer", 1, total_env_steps=800)
+    late = make(
+        "late", seeds=[1], settings={"trainer.seed": 1}, rows=[row | {"env_steps": 7} for row in metrics(1, [1])]
+    )
+    assert late.is_dir()
+    options = [word for group in groups for word in ("--group", group)]
+    assert main(["report", *options, "--out", "report.html"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {said}") and error.count("\n") == 1
+    assert not (tmp_path / "report.html").exists()
+
+
 def test_the_newest_small_film_is_shown_and_else_how_to_make_one(make, monkeypatch):
     folder = make("my run")
     assert "--run '" in page.film(folder)["command"] and page.film(folder)["large"] == []
