@@ -70,7 +70,9 @@ def known(word: str, words: Iterable[str]) -> str:
 
 
 def shown(value: Any, limit: int = 60) -> str:
-    """A value that a user gave, on one line and cut short."""
+    """A value that a user gave, as YAML spells it where Python would not, on one line and cut short."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
     try:
         text = "nan" if isinstance(value, float) and math.isnan(value) else repr(value)
     except ValueError:  # Python does not write whole numbers of thousands of digits

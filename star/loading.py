@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
@@ -115,6 +116,14 @@ def _with_overrides(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> 
     return nested
 
 
+_PLAIN = {
+    "a valid tuple": "a list such as [a, b]",
+    r"a valid dictionary( or instance of \w+)?": "a mapping such as {key: value}",
+    "a valid boolean(, unable to interpret input)?": "true or false",
+    "False, True": "false, true",
+}  # pydantic's words (regular expressions), and what users of YAML say
+
+
 def explain(error: ErrorDetails, model: type[BaseModel] = Config) -> str:
     """One pydantic error of `model` as one line: key, value, what is allowed."""
     path = [part if len(part) <= 60 else f"{part[:57]}..." for part in map(str, error["loc"])]
@@ -122,7 +131,8 @@ def explain(error: ErrorDetails, model: type[BaseModel] = Config) -> str:
     if error["type"] == "extra_forbidden":
         return f"{key}: unknown key{_nearest_key(path, model)}"
     message = error["msg"].removeprefix("Value error, ").replace("Input should be", "should be")
-    message = message.replace("a valid tuple", "a list such as [a, b]")
+    for words, plain in _PLAIN.items():
+        message = re.sub(words, plain, message)
     message = message[:1].lower() + message[1:]
     if error["type"] == "value_error" and not isinstance(error["input"], str | int | float | bool):
         return f"{key}: {message}" if key else message

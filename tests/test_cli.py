@@ -100,7 +100,7 @@ def refusal(capsys, folder, arguments):
         pytest.param("train point.yaml --tutor.period ten", "tutor.period: 'ten' is not allowed", id="wrong type"),
         pytest.param("train point.yaml --tutor.ppo 5", "tutor.ppo: 5 is not allowed", id="section as a value"),
         pytest.param("train point.yaml --commander.learning_rate nan", "finite", id="not a number"),
-        pytest.param("train point.yaml --trainer.num_envs true", "trainer.num_envs: True", id="boolean as a number"),
+        pytest.param("train point.yaml --trainer.num_envs true", "trainer.num_envs: true", id="boolean as a number"),
         pytest.param("train point.yaml --commander.discount -1", "commander.discount: -1", id="out of range"),
         pytest.param("train point.yaml --seeds 0", "trainer.num_seeds: 0", id="no seeds"),
         pytest.param("train point.yaml --tutor.period 7", "not a multiple", id="periods that do not fit"),

@@ -85,12 +85,12 @@ def test_a_key_like_no_other_lists_those_of_its_section(write):
         ("trainer: {num_envs: 1.5}", "trainer.num_envs", "1.5", "integer"),
         ("trainer: {seed: 2020-01-01}", "trainer.seed", "2020", "integer"),
         ("tutor: {reward_scale: [1]}", "tutor.reward_scale", "[1]", "number"),
-        ("tutor: {relative_bounds: maybe}", "tutor.relative_bounds", "'maybe'", "boolean"),
+        ("tutor: {relative_bounds: maybe}", "tutor.relative_bounds", "'maybe'", "true or false"),
         ("tutor: {ppo: {hidden: 64}}", "tutor.ppo.hidden", "64", "list"),
         ("tutor: {ppo: {hidden: [64, x]}}", "tutor.ppo.hidden.1", "'x'", "integer"),
-        ("tutor: 5", "tutor", "5", "dictionary"),
-        ("tutor:", "tutor", "None", "dictionary"),
-        ("env: {options: fast}", "env.options", "'fast'", "dictionary"),
+        ("tutor: 5", "tutor", "5", "a mapping such as"),
+        ("tutor:", "tutor", "null", "a mapping such as {key: value}"),
+        ("env: {options: fast}", "env.options", "'fast'", "a mapping such as"),
         ("env: {options: {goals: !!binary /w==}}", "env.options", "b'\\xff'", "text, a number"),
         ("env: {training: {cell: [2020-01-01]}}", "env.training", "datetime.date(2020, 1, 1)", "text, a number"),
     ],
@@ -110,6 +110,9 @@ def test_a_wrong_type_names_key_value_and_what_is_allowed(write, text, key, valu
         ("abstraction: {max_regions: 5000}", "abstraction.max_regions: 5000", "less than or equal to 1024"),
         ("refinement: {depth: 13}", "refinement.depth: 13", "less than or equal to 12"),
         ("tutor: {learner: sac}", "tutor.learner: 'sac'", "'ppo' or 'td3'"),
+        ("tutor: {enabled: 3}", "tutor.enabled: 3", "should be true or false"),
+        ("tutor: {enabled: [1]}", "tutor.enabled: [1]", "should be true or false"),
+        ("tutor: {enabled: null}", "tutor.enabled: null", "should be true or false"),
         ("commander: {successors: some}", "commander.successors: 'some'", "'all', 'any', 'possible' or 'known'"),
     ],
 )
@@ -128,7 +131,7 @@ def test_numbers_must_be_finite(write, key, value):
 @pytest.mark.parametrize("key", ["trainer.num_envs", "trainer.seed", "tutor.reward_scale", "refinement.depth"])
 @pytest.mark.parametrize("value", [True, False])
 def test_booleans_are_not_numbers(key, value):
-    with pytest.raises(ConfigError, match=rf"{key}: {value} is not allowed: should be a number"):
+    with pytest.raises(ConfigError, match=rf"{key}: {str(value).lower()} is not allowed: should be a number"):
         parse({}, {key: value})
 
 
@@ -404,5 +407,5 @@ def test_a_number_that_float32_cannot_hold_is_refused():
 def test_hold_has_three_values():
     for value in (False, True, "region"):
         assert parse({}, {"commander.hold": value}).commander.hold is value
-    with pytest.raises(ConfigError, match=r"commander.hold: 'goal' is not allowed: should be False, True or 'region'$"):
+    with pytest.raises(ConfigError, match=r"commander.hold: 'goal' is not allowed: should be false, true or 'region'$"):
         parse({}, {"commander.hold": "goal"})

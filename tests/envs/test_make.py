@@ -15,7 +15,7 @@ import envs
         ("point_maze", {"goal": "test"}, ["goal", "test", "goals"]),
         ("point_maze", {"goals": "tests"}, ["goals", "tests", "train, test"]),
         ("point_maze", {"episode_length": 0}, ["episode_length", "0", "from 1 to"]),
-        ("point_maze", {"episode_length": True}, ["episode_length", "True", "whole number"]),
+        ("point_maze", {"episode_length": True}, ["episode_length", "true", "whole number"]),
         ("point_maze", {"engine": "native"}, ["native", "auto, jax"]),
         ("ant_maze", {"engine": "wrap"}, ["wrap", 'did you mean "warp"']),
         ("ant_maze", {"integrator": "RK4"}, ["integrator", "RK4", "rk4"]),
