@@ -129,12 +129,7 @@ def _fitting(program: Program, env: Any, *, source: Path) -> Spec:
         raise ConfigError(
             f"env.options.episode_length: {here.episode_length} is not a multiple of tutor.period {period} of {source}"
         )
-    return dataclasses.replace(
-        trained,
-        episode_length=here.episode_length,
-        goal_indices=here.goal_indices,
-        success_radius=here.success_radius,
-    )
+    return trained.within(env)
 
 
 def _goals(env: Any, middles: np.ndarray) -> np.ndarray:

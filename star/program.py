@@ -105,19 +105,23 @@ class Program:
 def build(config: Config) -> Program:
     """Make the environments and the jitted functions of `config`; raises `ConfigError` if they cannot be made."""
     select_device(config.trainer.device)
-    env = make_env(config, "train")
+    env, test_env = (make_env(config, goals) for goals in ("train", "test"))
     spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
     config = resolve(config, env.engine, spec)
     try:
         states.check(config, spec)
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    test_env = make_env(config, "test")
     mesh = devices.mesh(config.trainer.devices)
     trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
     episodes = config.trainer.eval_episodes
     surplus = -episodes % config.trainer.devices  # each device plays as many
     tested = VectorEnv(test_env, episodes + surplus, auto_reset=False)
+    on_test = spec.within(test_env)
+    if on_test.episode_length % config.tutor.period:
+        raise ConfigError(
+            f"tutor.period: {config.tutor.period} does not divide the test episode of {on_test.episode_length}"
+        )
 
     @cache
     def lessons() -> tuple[Demonstrations, ...]:
@@ -135,7 +139,7 @@ def build(config: Config) -> Program:
 
     def evaluate(agent: AgentConfig, state: TrainState, keys: jax.Array) -> Any:
         def one_evaluation(one: AgentConfig, state: TrainState, key: jax.Array) -> Any:
-            played = episode.evaluate(one, spec, tested, state, key=key)
+            played = episode.evaluate(one, on_test, tested, state, key=key)
             return jax.tree.map(lambda x: x[:episodes], devices.whole(played))
 
         return jax.vmap(one_evaluation, in_axes=(_axis(agent), 0, 0))(agent, state, keys)
@@ -173,8 +177,9 @@ def resolve(config: Config, engine: str, spec: Spec) -> Config:
     """`config` with the engine, the map and the initial cuts that are really used."""
     values = config.model_dump(mode="json")
     values["env"]["engine"] = engine
-    if "map" in values["env"]["options"]:  # the run must not change with the file
-        values["env"]["options"]["map"] = arena.load(values["env"]["options"]["map"])
+    for options in (values["env"]["options"], values["env"]["training"]):
+        if "map" in options:  # the run must not change with the file
+            options["map"] = arena.load(options["map"])
     if values["abstraction"]["cuts"] is None and values["abstraction"]["grid"] is None:
         values["abstraction"]["cuts"] = spec.region_cuts
     return parse(values)

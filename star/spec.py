@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -45,6 +45,15 @@ class Spec:
             success_radius=float(env.success_radius),
             orientation=tuple(env.orientation),
             heading=heading,
+        )
+
+    def within(self, env: Any) -> Spec:
+        """The same levels in another environment: its episodes and its goals, their own space and subgoals."""
+        return replace(
+            self,
+            episode_length=env.episode_length,
+            goal_indices=tuple(env.goal_indices),
+            success_radius=float(env.success_radius),
         )
 
     @property

@@ -337,6 +337,26 @@ def test_auto_engine_and_the_cuts_of_the_task_are_resolved():
     assert config.abstraction.cuts == ((8.0,), (8.0,))
 
 
+@pytest.mark.parametrize("section", ["options", "training"])
+def test_a_map_is_kept_whatever_becomes_of_its_file(section, tmp_path):
+    path, rows = tmp_path / "map.txt", "11111\n1r001\n11111\n"
+    path.write_text(rows)
+    settings = {f"env.{section}.map": str(path), "abstraction.cuts": None, "abstraction.grid": [2]}
+    assert getattr(programs.build(parse(RUN, settings)).config.env, section)["map"] == rows
+
+
+def test_training_episodes_of_another_length_leave_evaluation_as_it_is():
+    shorter = {"env.training.episode_length": 20, "tutor.unroll": 1}
+    one, other = (programs.build(parse(RUN, {"tutor.unroll": 1} | more)) for more in ({}, shorter))
+    assert (one.spec.episode_length, other.spec.episode_length) == (60, 20)
+    found = [
+        program.evaluate(program.init(program.seed_keys()), program.evaluation_keys(0)) for program in (one, other)
+    ]
+    jax.tree.map(np.testing.assert_array_equal, *found)
+    with pytest.raises(ConfigError, match="tutor.period: 10 does not divide the test episode of 55"):
+        programs.build(parse(RUN, shorter | {"env.options.episode_length": 55}))
+
+
 def test_nothing_is_compiled_after_the_first_epoch(caplog):
     program = programs.build(tiny())
     start = jax.device_put(program.init(program.seed_keys()), jax.devices()[0])  # as `train` does
