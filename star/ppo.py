@@ -68,7 +68,7 @@ def init(key: Array, config: PPOConfig, *, example: Transition) -> PPOState:
     (obs_size,), (action_size,) = example.obs.shape, example.action.shape
     params = {
         "actor": _actor(config, action_size).init(actor_key, example.obs),
-        "log_std": jnp.full(action_size, jnp.log(config.initial_std), jnp.float32),
+        "log_std": jnp.full(action_size, jnp.log(jnp.maximum(config.initial_std, config.min_std)), jnp.float32),
         "critic": _critic(config).init(critic_key, example.obs),
     }
     return PPOState(
@@ -147,7 +147,7 @@ def advantages(
 
 def _policy(config: PPOConfig, params: Mapping[str, Any], obs: Array) -> tuple[Array, Array]:
     mean = apply(_actor(config, params["log_std"].shape[0]), params["actor"], obs)
-    return mean, jnp.maximum(jnp.exp(params["log_std"]), config.min_std)
+    return mean, jnp.exp(params["log_std"])
 
 
 def _value(config: PPOConfig, params: Mapping[str, Any], obs: Array) -> Array:
@@ -206,6 +206,8 @@ def _gradient_step(
     gradient, metrics = jax.grad(partial(_loss, config, penalty, imitation), has_aux=True)(params, batch)
     step, optimizer = _optimizer(config).update(gradient, optimizer)
     params = jax.tree.map(lambda p, s: p - learning_rate * s, params, step)
+    # here, not in the policy, whose gradient would vanish below: the deviation could never grow again
+    params = {**params, "log_std": jnp.maximum(params["log_std"], jnp.log(config.min_std))}
     return (params, optimizer), metrics
 
 

@@ -111,6 +111,15 @@ def test_the_step_size_shrinks_after_large_changes_of_the_policy_and_grows_after
         np.testing.assert_allclose(metrics["learning_rate"], state.learning_rate)
 
 
+def test_a_deviation_at_its_floor_can_grow_again(start, update):
+    chosen = settings(min_std=0.9, entropy=10.0)
+    low = start.replace(params=start.params | {"log_std": jnp.full(2, np.log(0.8), jnp.float32)})
+    state, metrics = update(chosen, low, random_rollout(), jax.random.key(1))
+    assert (np.exp(state.params["log_std"]) >= 0.9 - 1e-6).all()
+    again, _ = update(chosen, state, random_rollout(), jax.random.key(2))
+    assert (again.params["log_std"] > state.params["log_std"]).all()
+
+
 def test_it_learns_a_bandit_with_two_contexts():
     chosen = settings(learning_rate=3e-3, max_learning_rate=1e-2, passes=4, target_kl=0.05)
     example = EXAMPLE.replace(obs=jnp.zeros(1), next_obs=jnp.zeros(1), action=jnp.zeros(1))
