@@ -66,9 +66,10 @@ class CommanderState(struct.PyTreeNode):
 class Decision(struct.PyTreeNode):
     """Finished periods of N streams.
 
-    `weight` is 1 where the period really lasted k env steps, `lost` is 1 where the task was terminated in it, and
-    `practised` is 1 where a random region was pursued instead of the goal, and `shown` is 1 where a teacher chose the
-    target. The reward is that for the goal.
+    `weight` is 1 where the period really lasted k env steps, `lost` is 1 where the task was terminated in it,
+    `practised` is 1 where a random region was pursued instead of the goal, `aside` is 1 where what was commanded was a
+    waypoint, which tells nothing of its region, and `shown` is 1 where a teacher chose the target. The reward is that
+    for the goal.
     """
 
     region: Int[Array, "N"]
@@ -79,6 +80,7 @@ class Decision(struct.PyTreeNode):
     weight: Float[Array, "N"]
     lost: Float[Array, "N"]
     practised: Float[Array, "N"]
+    aside: Float[Array, "N"]
     shown: Float[Array, "N"] | None = None
 
 
@@ -172,10 +174,10 @@ def act(
     best = jnp.where(_targets(allowed.greedy, region, pursued), values, -jnp.inf)
     ties = best >= best.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best.shape), -1.0), axis=-1)
-    luck = jax.random.uniform(random_key, best.shape)
-    if attraction is not None:  # the largest of u^(1/w) is the one with the weight w in proportion to w
-        luck **= 1 / jnp.maximum(attraction, 1e-6)
-    anything = jnp.where(_targets(allowed.explore, region, pursued), luck, -1.0)
+    luck = jax.random.gumbel(random_key, best.shape)
+    if attraction is not None:
+        luck += jnp.log(jnp.maximum(attraction, 1e-6))
+    anything = jnp.where(_targets(allowed.explore, region, pursued), luck, -jnp.inf)
     exploring = jax.random.uniform(explore_key, region.shape) < epsilon
     return jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
 
@@ -197,13 +199,15 @@ def observe(
         state = _q_learning(config, state, allowed, batch)
         return state if batch.shown is None else _follow_teacher(config, state, batch, batch.shown, margin)
     cell = (batch.region, batch.goal_region, batch.target)
+    direct = 1 - batch.aside
+    weight = batch.weight * direct
     # Who practises and aims at the goal's region aims at its centre, which tells nothing of aiming at the goal.
-    telling = batch.weight * (1 - batch.practised * (batch.target == batch.goal_region))
+    telling = weight * (1 - batch.practised * (batch.target == batch.goal_region))
     model = state.model.replace(
-        led=state.model.led.at[batch.region, batch.target, batch.next_region].add(batch.weight),
+        led=state.model.led.at[batch.region, batch.target, batch.next_region].add(weight),
         rewards=state.model.rewards.at[cell].add(telling * batch.reward),
         visits=state.model.visits.at[cell].add(telling),
-        lost=state.model.lost.at[batch.region, batch.target].add(batch.lost),
+        lost=state.model.lost.at[batch.region, batch.target].add(batch.lost * direct),
     )
     return state.replace(model=model)
 
@@ -250,7 +254,7 @@ def fade(config: CommanderConfig, state: CommanderState) -> CommanderState:
 
 def measure(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> Metrics:
     """Mean reward of the decisions in `batch` and their mean absolute error of temporal difference."""
-    weight = batch.weight * (1 - batch.practised)
+    weight = _towards_goals(batch)
     n = jnp.maximum(weight.sum(), 1.0)
     error = _td_error(config, state, allowed, batch)
     return {"reward": jnp.sum(batch.reward * weight) / n, "td_error": jnp.sum(jnp.abs(error) * weight) / n}
@@ -258,7 +262,12 @@ def measure(config: CommanderConfig, state: CommanderState, allowed: Successors,
 
 def _q_learning(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> CommanderState:
     error = _td_error(config, state, allowed, batch)
-    return _step(config, state, batch, error, weight=batch.weight * (1 - batch.practised))
+    return _step(config, state, batch, error, weight=_towards_goals(batch))
+
+
+def _towards_goals(batch: Decision) -> Float[Array, "N"]:
+    """The weight of the decisions that pursued the goal of the task by way of a region."""
+    return batch.weight * (1 - batch.practised) * (1 - batch.aside)
 
 
 def _follow_teacher(

@@ -314,7 +314,7 @@ class RefinementConfig(Section):
     cuts: Literal["best", "random"] = Field("best", description="where a region is cut; random is for comparison")
     cuts_per_pair: Repeats = Field(1, description="cuts one examined pair may make")
     miss_lifetime: Annotated[int, Field(ge=0, lt=2**31)] = Field(
-        2, description="epochs after which a MISSES verdict is forgotten; with 0 there is none"
+        2, description="a MISSES verdict older than so many epochs is forgotten; with 0 there is none"
     )
 
 
@@ -530,6 +530,10 @@ class Config(Section):
             raise ValueError("sgim.strategies: babbling needs tutor.enabled, whose subgoals it replaces")
         if not self.commander.enabled and ("decomposition" in self.sgim.strategies or self.sgim.routes):
             raise ValueError("sgim: decomposition needs commander.enabled, whose targets it sets")
+        if self.sgim.exploration and not self.commander.enabled:
+            raise ValueError("sgim.exploration: needs commander.enabled, whose random targets it draws")
+        if self.sgim.refinement and not (self.commander.enabled and self.refinement.enabled):
+            raise ValueError("sgim.refinement: needs commander.enabled and refinement.enabled, whose pairs it orders")
         return self
 
     def learners(self) -> list[tuple[str, LevelConfig, int]]:

@@ -47,6 +47,8 @@ class Streams(struct.PyTreeNode):
     box: Box
     start: Float[Array, "B d"]
     reward: Float[Array, "B"]
+    waypoint: Bool[Array, "B"]
+    """Whether the box is that around a waypoint, not the target region or the goal's."""
     episode: Episode
     lesson: Lesson | None = None
 
@@ -156,6 +158,7 @@ def start(
         box=Box(lower=jnp.zeros_like(abstract), upper=jnp.zeros_like(abstract)),
         start=abstract,
         reward=jnp.zeros(n),
+        waypoint=jnp.zeros(n, bool),
         episode=Episode.start(n),
     )
 
@@ -223,6 +226,7 @@ def command(
         box=target_box(config, spec, state.abstraction, target, around_point, aim),
         start=spec.abstract(obs),
         reward=jnp.full_like(streams.reward, commander.start_reward(config.commander)),
+        waypoint=to_point,
         episode=streams.episode,
         lesson=lesson,
     )

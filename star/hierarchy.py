@@ -47,11 +47,10 @@ def epoch(
     config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, teachers: Sequence[Demonstrations] = ()
 ) -> tuple[TrainState, Metrics]:
     """One episode of all environments, its updates, one refinement. `teachers` are those of `config.sgim.teachers`."""
-    key, reset_key, scan_key, end_key = jax.random.split(state.key, 4)
+    key, reset_key, scan_key, end_key, lesson_key = jax.random.split(state.key, 5)
     streams = episode.start(spec, env, practice=commander.practice(config.commander), key=reset_key)
     streams = devices.share(streams)
     if config.sgim.enabled:
-        lesson_key = jax.random.fold_in(reset_key, 1)
         state, streams = _begin_lesson(config, spec, env, state, teachers, streams, key=lesson_key)
     segments = spec.episode_length // config.tutor.period
     blocks = (segments // config.tutor.unroll, config.tutor.unroll)
@@ -202,7 +201,7 @@ def _segment(
     """One decision of the Tutor: command, act, roll out, let Controller and Commander learn."""
     state, streams = carry
     key, number = inputs
-    command_key, tutor_key, rollout_key, update_key, reset_key = jax.random.split(key, 5)
+    command_key, tutor_key, rollout_key, update_key, reset_key, imitation_key = jax.random.split(key, 6)
     allowed = episode.successors(config, state)
     share = commander.epsilon(config.commander, _env_steps(spec, env, state))
     shares = commander.spread(config.commander, share, num_envs=env.num_envs)
@@ -219,7 +218,7 @@ def _segment(
         state.controller,
         experience,
         relabel=in_hindsight,
-        imitation=_imitation(config, spec, teachers, streams.lesson, key=update_key),
+        imitation=_imitation(config, spec, teachers, streams.lesson, key=imitation_key),
         key=update_key,
     )
     metrics = _prefix("controller", controller_metrics | {"reward": _weighted(experience.reward, experience.weight)})
@@ -278,13 +277,13 @@ def _learn_between_episodes(
     )
     periods = num_envs * (spec.episode_length // config.commander.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
-    at_goal = (decision.target == decision.goal_region) & (decision.practised == 0)
+    at_goal = (decision.target == decision.goal_region) & (decision.practised == 0) & (decision.aside == 0)
     goals = refinement.Goals.of(outcome, at_goal, radius=spec.success_radius)
     if config.forward_model.boxes == "reached":
         lower, upper = (corner[decision.next_region] for corner in (state.abstraction.lower, state.abstraction.upper))
         outcome = outcome.replace(lower=lower, upper=upper)
     error = forward_model.errors(config.forward_model, state.forward_model, outcome)
-    counted = outcome.weight * (at_goal == (decision.region == decision.target))
+    counted = outcome.weight * (1 - decision.aside) * (at_goal == (decision.region == decision.target))
     graph = refinement.observe(
         config, state.graph, region=decision.region, target=decision.target, error=error, weight=counted
     )
@@ -413,6 +412,10 @@ def finished_period(
     end = spec.abstract(steps.next_obs[-1])
     lesson = streams.lesson
     whole_segment = steps.alive[-1] * (1 - steps.ended[-1])
+    lost = jnp.max(steps.terminated * steps.alive, axis=0)
+    if lesson is not None:  # random subgoals tell nothing of where commands lead
+        mine = ~strategies.babbles(config.sgim, lesson)
+        whole_segment, lost = whole_segment * mine, lost * mine
     weight = jnp.where(streams.clock == 0, whole_segment, 0.0)
     decision = Decision(
         region=streams.region,
@@ -421,8 +424,9 @@ def finished_period(
         reward=streams.reward,
         next_region=jax.vmap(partial(regions.locate, state.abstraction))(end),
         weight=weight,
-        lost=jnp.max(steps.terminated * steps.alive, axis=0),
+        lost=lost,
         practised=(streams.practice >= 0).astype(weight.dtype),
+        aside=streams.waypoint.astype(weight.dtype),
         shown=None if lesson is None else strategies.guided(config.sgim, lesson).astype(weight.dtype),
     )
     outcome = Outcome(start=streams.start, lower=streams.box.lower, upper=streams.box.upper, end=end, weight=weight)

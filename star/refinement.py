@@ -6,7 +6,7 @@
         the forward model's held-out error on it has stopped falling
     the due pair with most transitions times epochs since it was examined is taken (star/reachability.py):
         all parts of i reach j:  edge i -> j, REACHES
-        none does:               MISSES, for `miss_lifetime` epochs, since the low levels are still learning
+        none does:               MISSES, until older than `miss_lifetime` epochs: the low levels are still learning
         some do:                 cut i along the axis that best parts the reaching from the missing leaves
     where no cut is made, since none is possible or (`neighbours`) i and j do not touch, there is an edge if all parts
     of i where agents have been reach j, else no verdict

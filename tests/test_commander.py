@@ -27,6 +27,7 @@ def random_batch(seed):
         weight=(rng.random(N) < 0.7).astype(np.float32),
         lost=(rng.random(N) < 0.2).astype(np.float32),
         practised=(rng.random(N) < 0.2).astype(np.float32),
+        aside=(rng.random(N) < 0.2).astype(np.float32),
     )
 
 
@@ -46,6 +47,7 @@ def slow_update(q, allowed, batch, *, alpha, discount):
             if (
                 batch.weight[n]
                 and not batch.practised[n]
+                and not batch.aside[n]
                 and (batch.region[n], batch.goal_region[n], batch.target[n]) == (i, g, j)
             ):
                 after = batch.next_region[n]
@@ -77,7 +79,9 @@ def test_the_measured_reward_is_that_of_whole_periods_with_the_goal_of_the_task(
     state, allowed = random_state(0)
     batch = random_batch(0)
     metrics = commander.measure(settings(), state, allowed, batch)
-    np.testing.assert_allclose(metrics["reward"], batch.reward[batch.weight > batch.practised].mean(), rtol=1e-5)
+    np.testing.assert_allclose(
+        metrics["reward"], batch.reward[batch.weight > batch.practised + batch.aside].mean(), rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("learner", ["q", "model"])
@@ -95,6 +99,8 @@ def slow_plan(batch, allowed, believed, *, discount, prior, sweeps):
     led, reward, visits = np.zeros((R, R, R + 1)), np.zeros((R, R, R)), np.zeros((R, R, R))
     for n in range(N):
         i, g, j = batch.region[n], batch.goal_region[n], batch.target[n]
+        if batch.aside[n]:
+            continue
         led[i, j, batch.next_region[n]] += batch.weight[n]
         led[i, j, R] += batch.lost[n]  # a state that is worth nothing
         if not (batch.practised[n] and j == g):
@@ -153,6 +159,7 @@ def many(region, target, next_region, *, count=100, lost=0.0):
         weight=np.float32(1 - lost) * ones,
         lost=np.float32(lost) * ones,
         practised=np.zeros(count, np.float32),
+        aside=np.zeros(count, np.float32),
     )
 
 

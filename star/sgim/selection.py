@@ -313,7 +313,7 @@ def _shares(worth: Float[Array, "*n K"], mask: Bool[Array, "K"]) -> Float[Array,
     """Probabilities in proportion to `worth` where `mask`; even ones where nothing there is worth anything."""
     worth = worth * mask
     total = worth.sum(axis=-1, keepdims=True)
-    return jnp.where(total > 0, worth / jnp.where(total > 0, total, 1.0), mask / mask.sum())
+    return jnp.where(total > 0, worth / jnp.where(total > 0, total, 1.0), mask / jnp.maximum(mask.sum(), 1))
 
 
 def _goal(config: SelectionConfig, state: SgimState, region: Array, mode: Array, *, key: Array) -> Float[Array, "d"]:

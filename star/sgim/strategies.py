@@ -2,7 +2,7 @@
 
     alone    autonomous      the three levels as ever
              babbling        random subgoals instead of the Tutor's
-             decomposition   first to what is mastered best in another region, then to the goal
+             decomposition   first to what is mastered best in some region, then to the goal
     teacher  outcome         the goal is the demonstrated outcome nearest to it (emulation)
              action          so it is, and the Controller imitates the demonstrated actions (mimicry)
              decomposition   along the demonstrated route, region by region and waypoint by waypoint
@@ -253,7 +253,7 @@ def _prepare(
         mine = choice.strategy == config.strategies.index("decomposition")
         via = jax.random.randint(key, mine.shape, 0, state.abstraction.count)
         by_way_of = selection.mastered(state)[via]
-        waypoints, guided = waypoints.at[:, 0].set(jnp.where(mine[:, None], by_way_of, waypoints[:, 0])), guided | mine
+        waypoints, guided = jnp.where(mine[:, None, None], by_way_of[:, None], waypoints), guided | mine
     for number, (teacher, demos) in enumerate(zip(config.teachers, teachers, strict=True), len(config.strategies)):
         mine = taught & (choice.strategy == number)
         if teacher.kind == "decomposition":

@@ -125,6 +125,16 @@ def test_own_decomposition_goes_by_way_of_what_is_mastered_best_in_a_region():
     assert not strategies.guided(config, lesson).any()
 
 
+def test_own_decomposition_has_one_waypoint_however_many_teachers_show():
+    config = settings(strategies=["autonomous", "decomposition"], teachers=[GUIDE])
+    lesson, *_ = lesson_of(config, teachers=[demonstrations(length=L)])
+    mine = np.asarray(lesson.choice.strategy) == 1
+    assert mine.any() and lesson.waypoints.shape[1] == L
+    there = np.asarray(lesson.waypoints[:, 0])
+    after, _, to_point = strategies.impose(config, lesson, jnp.asarray(there))
+    assert not to_point[mine].any() and (np.asarray(after.leg)[mine] == L).all()
+
+
 def test_no_teacher_is_asked_more_often_than_his_budget_and_none_who_is_away():
     config = settings(teachers=[{**GUIDE, "max_queries": 5}, {**AIMS, "availability": 0}])
     taught = jnp.arange(B) % 4 > 0
@@ -285,6 +295,18 @@ def test_random_targets_follow_their_attraction():
     assert stats.chisquare(counts[[0, 2, 3]], n * np.array([1, 2, 3]) / 6).pvalue > 1e-3
 
 
+def test_targets_that_hardly_attract_are_drawn_evenly_among_themselves():
+    size, n = 4, 3000
+    state = commander.init(loading.parse({}).commander, regions=size)
+    allowed = jnp.ones((size, size), bool).at[:, 0].set(False)
+    zeros = jnp.zeros(n, jnp.int32)
+    successors, attraction = commander.Successors(allowed, allowed), jnp.array([1.0, 1e-4, 1e-4, 1e-4])
+    targets = commander.act(
+        state, successors, zeros + 1, zeros + 1, attraction=attraction, epsilon=1.0, key=jax.random.key(0)
+    )
+    assert stats.chisquare(np.bincount(targets, minlength=size)[1:]).pvalue > 1e-3
+
+
 def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
     config = loading.parse({"commander": {"learner": "q", "learning_rate": 0.5, "reward": "mean"}}).commander
     state = commander.init(config, regions=3)
@@ -300,9 +322,11 @@ def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
         weight=one(1.0),
         lost=one(0.0),
         practised=one(0.0),
+        aside=one(1.0),
         shown=one(1.0),
     )
-    alone = commander.observe(config, state, allowed, decision.replace(shown=None)).q[0, 1, 2]
+    alone = state.q[0, 1, 2]  # a waypoint tells nothing of what its region is worth
+    assert commander.observe(config, state, allowed, decision.replace(shown=None)).q[0, 1, 2] == alone
     taught = commander.observe(config, state, allowed, decision, margin=0.2).q[0, 1, 2]
     assert float(taught) == pytest.approx(float(alone) + 0.5 * (1.0 + 0.2 - float(alone)))
     ignored = commander.observe(config, state, allowed, decision.replace(shown=one(0.0)), margin=0.2).q[0, 1, 2]
@@ -373,6 +397,8 @@ def test_steps_of_demonstrations_lead_to_the_end_of_their_segment():
         ({"sgim": {"teachers": [{**GUIDE, "cost": 0}]}}, "sgim.teachers.0.cost: 0 is not allowed"),
         ({"sgim": {"strategies": ["babbling"]}, "tutor": {"enabled": False}}, "babbling needs tutor.enabled"),
         ({"sgim": {"teachers": [GUIDE]}, "commander": {"enabled": False}}, "decomposition needs commander.enabled"),
+        ({"sgim": {"exploration": True}, "commander": {"enabled": False}}, "sgim.exploration: needs commander.enabled"),
+        ({"sgim": {"refinement": True}, "refinement": {"enabled": False}}, "sgim.refinement: needs commander.enabled"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(values, told):
@@ -532,7 +558,7 @@ def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, bre
         np.argwhere(np.asarray(regions.adjacent(state.abstraction)) & ~np.eye(len(state.graph.told), dtype=bool))[0],
     )
     nothing = jnp.zeros(3, jnp.int32)
-    decision = commander.Decision(*[nothing] * 3, *[jnp.zeros(3)] * 1, nothing, *[jnp.zeros(3)] * 3)
+    decision = commander.Decision(*[nothing] * 3, *[jnp.zeros(3)] * 1, nothing, *[jnp.zeros(3)] * 4)
     allowed = episode.successors(agent, state)
     last = agent.commander.period // agent.tutor.period - 1
 
@@ -542,6 +568,33 @@ def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, bre
         return hierarchy._command_better(agent, spec, known, allowed, decision, jnp.int32(last)).model.reach[i, j, j]
 
     assert float(value(-1)) < float(value(0)) == float(value(1))
+
+
+def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, breaking_env):
+    own = {"strategies": ["autonomous", "babbling", "decomposition"], "waypoint_radius": 0.01}
+    agent, spec = loading.parse({**tiny, "sgim": own}).agent(), Spec.of(breaking_env.env)
+    lesson = jax.tree.map(lambda x: x[: breaking_env.num_envs], lesson_of(agent.sgim)[0])
+    babbling, detour = (np.asarray(lesson.choice.strategy) == number for number in (1, 2))
+    assert babbling.any() and detour.any() and not (babbling | detour).all()
+
+    @jax.jit
+    def finished(key):
+        state = star.state.init(agent, spec, key=key)
+        streams = episode.start(spec, breaking_env, key=key).replace(lesson=lesson)
+        allowed = episode.successors(agent, state)
+        streams = episode.command(agent, spec, state, allowed, streams, epsilon=0.0, key=key)
+        subgoal, _ = episode.choose_subgoal(agent, spec, state, streams, deterministic=False, key=key)
+        streams, steps = episode.rollout(
+            agent, spec, breaking_env, state, streams, subgoal, deterministic=False, key=key
+        )
+        ones = jnp.ones_like(steps.alive)
+        steps = steps.replace(alive=ones, ended=0 * ones, terminated=ones)
+        return hierarchy.finished_period(agent, spec, state, streams.replace(clock=0 * streams.clock), steps)
+
+    decision, outcome = finished(jax.random.key(0))
+    np.testing.assert_array_equal(decision.aside, detour)
+    for told in (decision.weight, decision.lost, outcome.weight):
+        np.testing.assert_array_equal(np.asarray(told) > 0, ~babbling)
 
 
 def test_everything_that_learns_stays_finite(schooled):
