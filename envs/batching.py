@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,17 @@ from jax.sharding import PartitionSpec
 
 AXIS = "envs"
 """The axis of a mesh of devices over which environments are shared out."""
+
+T = TypeVar("T")
+
+
+def where(mask: jax.Array, new: T, old: T) -> T:
+    """`new` where `mask` [...] is set, else `old`: pytrees whose leaves [..., ...] begin with the axes of the mask."""
+
+    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
+
+    return jax.tree.map(pick, new, old)
 
 
 def flattened(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -11,13 +11,11 @@ result back. On a mesh of devices each does so with its share of the B.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from envs._quiet import Env, State
-from envs.batching import flattened, shared_out
+from envs.batching import flattened, shared_out, where
 
 
 class VectorEnv:
@@ -50,7 +48,7 @@ class VectorEnv:
 
     def with_goals(self, state: State, goals: jax.Array, mask: jax.Array) -> State:
         """`state` with the desired goals [B, k] where `mask` (bool [B]) is set, at the start of episodes."""
-        return _select(mask, jax.vmap(self.env.with_goal)(state, goals), state)
+        return where(mask, jax.vmap(self.env.with_goal)(state, goals), state)
 
     def _begin(self, rng: jax.Array) -> State:
         """New episodes, one for each key of `rng` [n]. Each keeps a key of its own for the resets to come."""
@@ -70,16 +68,7 @@ class VectorEnv:
         fresh = self._begin(state.info["rng"])
         kept = {key: state.info[key] for key in ("truncation", "final_obs")}
         fresh = fresh.replace(reward=state.reward, done=state.done, metrics=state.metrics, info={**fresh.info, **kept})
-        return _select(state.done > 0, fresh, state)
+        return where(state.done > 0, fresh, state)
 
     def _reset_batch(self, state: State, mask: jax.Array, rng: jax.Array) -> State:
-        return _select(mask, self._begin(rng), state)
-
-
-def _select(mask: jax.Array, yes: Any, no: Any) -> Any:
-    """`yes` where `mask` [n] is set, else `no`, leaf by leaf [n, ...]."""
-
-    def pick(a: jax.Array, b: jax.Array) -> jax.Array:
-        return jnp.where(mask.reshape(mask.shape + (1,) * (a.ndim - 1)), a, b)
-
-    return jax.tree.map(pick, yes, no)
+        return where(mask, self._begin(rng), state)

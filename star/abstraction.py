@@ -13,16 +13,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
-
-T = TypeVar("T")
 
 
 class Abstraction(struct.PyTreeNode):
@@ -136,8 +133,3 @@ def inherit(table: Array, *, parent: Array, child: Array, axes: Sequence[int]) -
         moved = jnp.moveaxis(table, axis, 0)
         table = jnp.moveaxis(moved.at[child].set(moved[parent]), 0, axis)
     return table
-
-
-def where(done: Bool[Array, ""], new: T, old: T) -> T:
-    """`new` if `done` else `old`, for whole pytrees."""
-    return jax.tree.map(lambda a, b: jnp.where(done, a, b), new, old)

@@ -173,9 +173,7 @@ def measure(ended: episode.Episode, position: jax.Array, success: jax.Array, *, 
     return Trials(episode=ended, steps=steps.astype(jnp.float32), path=path, start=position[0], goal=goal)
 
 
-def evaluate(
-    targets: Sequence[Target], exam: Exam, *, quiet: bool = True, console: Console | None = None
-) -> list[dict[str, Any]]:
+def evaluate(targets: Sequence[Target], exam: Exam, *, quiet: bool = True) -> list[dict[str, Any]]:
     """A row of plain values for every checkpoint, in the order of `targets`.
 
     Agents whose settings agree in structure share what is compiled. The config in every checkpoint is looked at before
@@ -184,7 +182,7 @@ def evaluate(
     Raises:
       ConfigError: in one line, for whatever cannot be evaluated.
     """
-    console = console or Console(stderr=True)
+    console = Console(stderr=True)
     busy = contextlib.nullcontext() if quiet or not console.is_terminal else console.status("preparing")
     with contextlib.ExitStack() as stack:
         status = stack.enter_context(busy)

@@ -36,6 +36,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from star.abstraction import inherit
 from star.config import CommanderConfig
+from star.replay import weighted_mean
 
 Metrics = dict[str, Array]
 
@@ -255,9 +256,8 @@ def fade(config: CommanderConfig, state: CommanderState) -> CommanderState:
 def measure(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> Metrics:
     """Mean reward of the decisions in `batch` and their mean absolute error of temporal difference."""
     weight = _towards_goals(batch)
-    n = jnp.maximum(weight.sum(), 1.0)
     error = _td_error(config, state, allowed, batch)
-    return {"reward": jnp.sum(batch.reward * weight) / n, "td_error": jnp.sum(jnp.abs(error) * weight) / n}
+    return {"reward": weighted_mean(batch.reward, weight), "td_error": weighted_mean(jnp.abs(error), weight)}
 
 
 def _q_learning(config: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision) -> CommanderState:

@@ -19,6 +19,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from envs._quiet import State as EnvState
+from envs.batching import where
 from envs.vector import VectorEnv
 from star import abstraction as regions
 from star import commander, controller, learner, tutor
@@ -352,9 +353,4 @@ def _record(episode: Episode, env_state: EnvState, alive: Float[Array, "B"]) -> 
 
 def _select(mask: Bool[Array, "B"], new: Streams, old: Streams) -> Streams:
     """`new` where `mask`, else `old`, environment by environment; the environments' own state is `new`'s."""
-
-    def pick(a: Array, b: Array) -> Array:
-        return jnp.where(mask.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
-
-    chosen = jax.tree.map(pick, new.replace(env=None), old.replace(env=None))
-    return chosen.replace(env=new.env)
+    return where(mask, new.replace(env=None), old.replace(env=None)).replace(env=new.env)

@@ -146,4 +146,4 @@ def _predict(config: ForwardModelConfig, params: Any, space: Array, start: Array
 def _loss(config: ForwardModelConfig, params: Any, space: Array, batch: Outcome) -> Array:
     predicted = _predict(config, params, space, batch.start, batch.lower, batch.upper)
     scaled = (predicted - batch.end) / _scaling(space)[1]
-    return jnp.sum(jnp.square(scaled).mean(axis=-1) * batch.weight) / jnp.maximum(batch.weight.sum(), 1.0)
+    return replay.weighted_mean(jnp.square(scaled).mean(axis=-1), batch.weight)

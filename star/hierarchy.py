@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from envs.batching import where
 from envs.vector import VectorEnv
 from star import abstraction as regions
 from star import adjacency, commander, controller, devices, episode, faults, forward_model, learner, refinement, tutor
@@ -31,7 +32,7 @@ from star.commander import CommanderState, Decision, Successors
 from star.config import AgentConfig
 from star.episode import Episode, Steps, Streams
 from star.forward_model import Outcome
-from star.replay import Imitation, Penalty, Transition, flatten
+from star.replay import Imitation, Penalty, Transition, flatten, weighted_mean
 from star.sgim import selection, strategies
 from star.sgim.selection import SgimState
 from star.sgim.strategies import Lesson
@@ -221,11 +222,13 @@ def _segment(
         imitation=_imitation(config, spec, teachers, streams.lesson, key=imitation_key),
         key=update_key,
     )
-    metrics = _prefix("controller", controller_metrics | {"reward": _weighted(experience.reward, experience.weight)})
+    metrics = _prefix(
+        "controller", controller_metrics | {"reward": weighted_mean(experience.reward, experience.weight)}
+    )
     streams = episode.advance(config, streams)
     decision, outcome = finished_period(config, spec, state, streams, steps)
     if config.commander.enabled:
-        known = _command_better(config, spec, state, allowed, devices.whole(decision), number)
+        known = _command_better(config, state, allowed, devices.whole(decision), number)
         state = state.replace(commander=known)
     transition = None
     if tutor_action is not None:
@@ -250,7 +253,7 @@ def _segment(
 
 
 def _command_better(
-    config: AgentConfig, spec: Spec, state: TrainState, allowed: Successors, decision: Decision, number: Array
+    config: AgentConfig, state: TrainState, allowed: Successors, decision: Decision, number: Array
 ) -> CommanderState:
     """The Commander after the decisions that ended with segment `number` of the episode."""
     learnt = commander.observe(config.commander, state.commander, allowed, decision, margin=config.sgim.margin)
@@ -295,7 +298,7 @@ def _learn_between_episodes(
     state = state.replace(commander=commander.fade(config.commander, state.commander))
     metrics = (
         _prefix("commander", commander_metrics)
-        | _prefix("forward_model", model_metrics | {"error": jnp.sqrt(_weighted(error, outcome.weight))})
+        | _prefix("forward_model", model_metrics | {"error": jnp.sqrt(weighted_mean(error, outcome.weight))})
         | _prefix("refinement", refine_metrics)
         | {"abstraction/regions": state.abstraction.count}
     )
@@ -323,8 +326,8 @@ def refine(
         after = commander.on_split(ours, parent=split.parent, child=split.child)
         if known is not None:
             parts, _ = regions.split(known.abstraction, split.cut, min_width=0.0)
-            known = selection.on_split(config.sgim.selection, known, parts, parent=split.parent, child=split.child)
-        return regions.where(split.done, (after, known), tables), None
+            known = selection.on_split(known, parts, parent=split.parent, child=split.child)
+        return where(split.done, (after, known), tables), None
 
     (commander_state, known), _ = jax.lax.scan(follow, (state.commander, state.sgim), splits)
     return state.replace(abstraction=abstraction, graph=graph, commander=commander_state, sgim=known), metrics
@@ -364,14 +367,12 @@ def _in_hindsight(config: AgentConfig, spec: Spec, batch: Transition, key: Array
     price = config.controller.termination_penalty * batch.terminated
     replaced = jax.random.bernoulli(key, 0.5, batch.reward.shape)
 
-    def pick(new: Array, old: Array) -> Array:
-        return jnp.where(replaced.reshape(-1, *(1,) * (old.ndim - 1)), new, old)
-
-    return batch.replace(
-        obs=pick(batch.obs.at[:, -size:].set(before), batch.obs),
-        next_obs=pick(batch.next_obs.at[:, -size:].set(after), batch.next_obs),
-        reward=pick(controller.reward(config.controller, before, after, size=p) - price, batch.reward),
+    relabelled = batch.replace(
+        obs=batch.obs.at[:, -size:].set(before),
+        next_obs=batch.next_obs.at[:, -size:].set(after),
+        reward=controller.reward(config.controller, before, after, size=p) - price,
     )
+    return where(replaced, relabelled, batch)
 
 
 def _tutor_transition(
@@ -472,15 +473,11 @@ def _env_steps(spec: Spec, env: VectorEnv, state: TrainState) -> Float[Array, ""
 
 def _episode_metrics(name: str, episode: Episode, weight: Array) -> Metrics:
     return {
-        f"{name}/success_any": _weighted(episode.success_any, weight),
-        f"{name}/success_final": _weighted(episode.success_final, weight),
-        f"{name}/distance": _weighted(episode.distance, weight),
-        f"{name}/return": _weighted(episode.total, weight),
+        f"{name}/success_any": weighted_mean(episode.success_any, weight),
+        f"{name}/success_final": weighted_mean(episode.success_final, weight),
+        f"{name}/distance": weighted_mean(episode.distance, weight),
+        f"{name}/return": weighted_mean(episode.total, weight),
     }
-
-
-def _weighted(x: Array, weight: Array) -> Array:
-    return jnp.sum(x * weight) / jnp.maximum(weight.sum(), 1.0)
 
 
 def _prefix(level: str, metrics: Metrics) -> Metrics:

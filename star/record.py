@@ -44,7 +44,6 @@ def record(
     seed: int = 0,
     force: bool = False,
     quiet: bool = False,
-    console: Console | None = None,
 ) -> str:
     """Write the demonstrations of a checkpoint of `run_dir` to `out`; returns a line that says what was written.
 
@@ -54,8 +53,7 @@ def record(
       ConfigError: in one line, for whatever cannot be had; nothing is written then.
     """
     teachers.check_place(out, force=force)
-    console = console or Console(stderr=True)
-    with contextlib.nullcontext() if quiet else console.status("recording"):
+    with contextlib.nullcontext() if quiet else Console(stderr=True).status("recording"):
         moments, spec = play(config, run_dir, checkpoint=checkpoint, agent=agent, episodes=episodes, seed=seed)
     demos = demonstrations(moments, spec, period=config.commander.period)
     if demos is None:

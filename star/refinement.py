@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from envs.batching import where
 from star import abstraction as regions
 from star import forward_model, reachability
 from star.abstraction import Abstraction, Cut
@@ -291,7 +292,7 @@ def on_split(graph: Graph, split: Split) -> Graph:
         transitions=jnp.where(changed[:, None] | changed[None, :], 0.0, parts.transitions),
         told=jnp.where(changed[:, None] | changed[None, :], jnp.minimum(parts.told, 0), parts.told),
     )
-    return regions.where(split.done, parts, graph)
+    return where(split.done, parts, graph)
 
 
 def _widening(half: Float[Array, "*n d"], radius: float | Array) -> Float[Array, "*n d"]:
@@ -372,7 +373,7 @@ def _cut(
         child = abstraction.count
         after, possible = regions.split(abstraction, cut, min_width=min_width)
         split = Split(done=mixed & possible & (gain > 1e-6), cut=cut, child=jnp.minimum(child, parts.shape[0] - 1))
-        abstraction = regions.where(split.done, after, abstraction)
+        abstraction = where(split.done, after, abstraction)
         parts = parts.at[split.child].set(parts[split.child] | split.done)
         return (abstraction, on_split(graph, split), parts), split
 

@@ -89,7 +89,6 @@ def render(
     exam: Exam = _TEST,
     episode: int | None = None,
     quiet: bool = False,
-    console: Console | None = None,
 ) -> str:
     """Record and draw an episode; returns a line that says what was written.
 
@@ -101,7 +100,7 @@ def render(
       ConfigError: in one line, for whatever cannot be had; nothing is written then.
     """
     try:
-        with _progress(console or Console(stderr=True), quiet) as progress:
+        with _progress(Console(stderr=True), quiet) as progress:
             task = progress.add_task("recording", total=None)
             if run_dir is None:
                 recording = record_random(config, envs=show.envs, steps=show.steps, seed=exam.seed)

@@ -55,6 +55,11 @@ def flatten(batch: Any) -> Any:
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
 
 
+def weighted_mean(x: Float[Array, "*n"], weight: Float[Array, "*n"]) -> Float[Array, ""]:
+    """Mean of `x` where `weight` is 1 of 0 and 1; 0 where there is none."""
+    return jnp.sum(x * weight) / jnp.maximum(weight.sum(), 1.0)
+
+
 def create(example: Any, *, size: int) -> Ring:
     """An empty ring of `size` items shaped like `example` (no leading axis)."""
     ring = _buffer(size, 1).init(example)

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from envs.batching import where
 from star import evaluation, memory
 from star import program as programs
 from star.config import Config
 from star.metrics import of_epoch
 from star.state import TrainState
+
+_where = jax.jit(where)
 
 
 class SideBySide:
@@ -50,7 +51,7 @@ class SideBySide:
             self._state = fresh
         else:
             new = np.repeat([slot in runs for slot in range(self.slots)], each)
-            self._state = _replace_where(new, fresh, self._state)
+            self._state = _where(new, fresh, self._state)
 
     def advance(self) -> list[list[dict[str, Any]]]:
         """Train all slots for an epoch: the metrics of each seed, for each slot, with `eval/` where it is time."""
@@ -71,9 +72,3 @@ class SideBySide:
 
     def _seeds(self) -> list[int]:
         return [seed for config in self._configs for seed in programs.seeds_of(config)]
-
-
-@jax.jit
-def _replace_where(mask: jax.Array, new: TrainState, old: TrainState) -> TrainState:
-    """`new` where `mask` [n] is set, else `old`, along the leading axis."""
-    return jax.vmap(lambda pick, a, b: jax.tree.map(partial(jnp.where, pick), a, b))(mask, new, old)

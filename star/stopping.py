@@ -32,8 +32,8 @@ class Stop:
     While `patient` is set nothing is overdue.
     """
 
-    def __init__(self, on_first: Callable[[], None]) -> None:
-        self.on_first = on_first
+    def __init__(self) -> None:
+        self.on_first: Callable[[], None] = lambda: None
         self.terminated = False
         self.patient = False
         self._since: float | None = None
@@ -76,9 +76,9 @@ class Stop:
 
 
 @contextlib.contextmanager
-def interruptible(on_first: Callable[[], None] = lambda: None) -> Iterator[Stop]:
-    """Yields what tells whether Ctrl-C was pressed or SIGTERM came; the first of them calls `on_first`."""
-    stop = Stop(on_first)
+def interruptible() -> Iterator[Stop]:
+    """Yields what tells whether Ctrl-C was pressed or SIGTERM came; the first of them calls its `on_first`."""
+    stop = Stop()
     before = {number: signal.signal(number, stop.hear) for number in _SIGNALS}
     try:
         yield stop

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 from star import devices, replay
 from star.config import TD3Config
 from star.networks import MLP, apply
-from star.replay import Imitation, Penalty, Transition, flatten
+from star.replay import Imitation, Penalty, Transition, flatten, weighted_mean
 
 Metrics = dict[str, Array]
 Relabel = Callable[[Transition, Array], Transition]
@@ -156,8 +156,8 @@ def _critic_loss(config: TD3Config, params: Any, target: Any, batch: Transition,
     next_q = _q(config, target["critic"], batch.next_obs, jnp.clip(next_action + noise, -1.0, 1.0)).min(axis=0)
     goal = batch.reward + config.discount * (1 - batch.terminated) * next_q
     q = _q(config, params, batch.obs, batch.action)
-    loss = _mean(jnp.square(q - goal).sum(axis=0), batch.weight)
-    return loss, {"critic_loss": loss, "q": _mean(q[0], batch.weight)}
+    loss = weighted_mean(jnp.square(q - goal).sum(axis=0), batch.weight)
+    return loss, {"critic_loss": loss, "q": weighted_mean(q[0], batch.weight)}
 
 
 def _actor_loss(
@@ -170,7 +170,7 @@ def _actor_loss(
 ) -> tuple[Array, Metrics]:
     action = _policy(config, params, batch.obs, batch.action.shape[-1])
     price = penalty(batch, action) if penalty is not None else 0.0
-    loss = _mean(price - _q(config, critic, batch.obs, action)[0], batch.weight)
+    loss = weighted_mean(price - _q(config, critic, batch.obs, action)[0], batch.weight)
     if imitation is not None:
         loss += imitation.loss(_policy(config, params, imitation.obs, batch.action.shape[-1]))
     return loss, {"actor_loss": loss}
@@ -183,10 +183,6 @@ def _adam_step(
     step, stepped = optax.scale_by_adam().update(gradient, optimizer)
     params = jax.tree.map(lambda p, s: p - jnp.where(enabled, learning_rate * s, 0.0), params, step)
     return params, jax.tree.map(lambda new, old: jnp.where(enabled, new, old), stepped, optimizer)
-
-
-def _mean(x: Array, weight: Array) -> Array:
-    return jnp.sum(x * weight) / jnp.maximum(weight.sum(), 1.0)
 
 
 def _action_size(state: TD3State) -> int:

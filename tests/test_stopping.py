@@ -12,7 +12,8 @@ from star.stopping import Overdue, interruptible
 def test_the_first_signal_asks_and_the_second_stops_at_once(number):
     told = []
     before = signal.getsignal(number)
-    with interruptible(lambda: told.append(1)) as stop:
+    with interruptible() as stop:
+        stop.on_first = lambda: told.append(1)
         assert not stop()
         signal.raise_signal(number)
         assert stop() and stop.terminated == (number == signal.SIGTERM) and told == [1]

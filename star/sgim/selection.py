@@ -33,6 +33,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from envs.batching import where
 from star import abstraction as regions
 from star.abstraction import Abstraction, Cut
 from star.config import SelectionConfig
@@ -106,7 +107,7 @@ def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[floa
     )
 
 
-def progress(config: SelectionConfig, state: SgimState) -> Float[Array, "R"]:
+def progress(state: SgimState) -> Float[Array, "R"]:
     """How much the competence of each region has grown over its window, in units of competence; 0 if inactive."""
     newer, older = _halves(state)
     grown = _mean(state.competences, newer) - _mean(state.competences, older)
@@ -208,14 +209,7 @@ def update(
     return state.replace(refused=state.refused + jnp.sum(given & ~finite), blocks=state.blocks + 1)
 
 
-def on_split(
-    config: SelectionConfig,
-    state: SgimState,
-    abstraction: Abstraction,
-    *,
-    parent: Int[Array, ""],
-    child: Int[Array, ""],
-) -> SgimState:
+def on_split(state: SgimState, abstraction: Abstraction, *, parent: Int[Array, ""], child: Int[Array, ""]) -> SgimState:
     """Follow a cut of region `parent`, whose upper part is `child` in the new `abstraction`.
 
     Each remembered goal goes to the part it lies in, in the order in which it was practised. What strategies add holds
@@ -280,8 +274,8 @@ def split(config: SelectionConfig, state: SgimState) -> tuple[SgimState, Bool[Ar
     cut = Cut(region=best[0], dimension=best[1], position=positions[best])
     after, possible = regions.split(state.abstraction, cut, min_width=config.min_width)
     done = possible & (scores[best] > 0)
-    cut_state = on_split(config, state, after, parent=cut.region, child=state.abstraction.count)
-    return regions.where(done, cut_state, state), done
+    cut_state = on_split(state, after, parent=cut.region, child=state.abstraction.count)
+    return where(done, cut_state, state), done
 
 
 def _distributions(

@@ -235,7 +235,7 @@ def _fitted(points: Float[Array, "n d"], most: int, *, key: Array) -> Mixture:
 
 def _by_progress(config: SelectionConfig, state: SgimState, *, random: float = 0.2) -> Float[Array, "R"]:
     """Probabilities of regions in proportion to the progress over their windows; a share `random` is even."""
-    grown, even = jnp.maximum(selection.progress(config, state), 0.0), 1 / len(state.written)
+    grown, even = jnp.maximum(selection.progress(state), 0.0), 1 / len(state.written)
     total = grown.sum()
     return random * even + (1 - random) * jnp.where(total > 0, grown / jnp.where(total > 0, total, 1.0), even)
 

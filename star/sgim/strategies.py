@@ -199,7 +199,7 @@ def urgency(config: SgimConfig, state: SgimState) -> Float[Array, "R"] | float:
     if not config.refinement:
         return 1.0
     mastery = selection.competence(state)
-    standing = 1 - jnp.minimum(jnp.abs(selection.progress(config.selection, state)), 1.0)
+    standing = 1 - jnp.minimum(jnp.abs(selection.progress(state)), 1.0)
     return 0.1 + 0.9 * 4 * mastery * (1 - mastery) * standing
 
 

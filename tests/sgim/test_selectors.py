@@ -96,7 +96,7 @@ def test_exp4_trusts_its_experts_as_in_a_loop():
     for _ in range(60):
         region, strategy = rng.integers(R), rng.integers(S)
         competences = np.full(4, rng.uniform(), np.float32)
-        grown = np.maximum(np.asarray(sgim.progress(config, state[0])), 0)
+        grown = np.maximum(np.asarray(sgim.progress(state[0])), 0)
         where = 0.2 / R + 0.8 * (grown / grown.sum() if grown.sum() > 0 else np.full(R, 1 / R))
         own = np.asarray(probabilities(config, state[0]))[region, strategy]
         advised = np.array([1 / (R * S), own, *(where[region] * (s == strategy) for s in range(S))])

@@ -565,7 +565,7 @@ def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, bre
     def value(told):
         graph = state.graph.replace(told=state.graph.told.at[i, j].set(told))
         known = state.replace(graph=graph)
-        return hierarchy._command_better(agent, spec, known, allowed, decision, jnp.int32(last)).model.reach[i, j, j]
+        return hierarchy._command_better(agent, known, allowed, decision, jnp.int32(last)).model.reach[i, j, j]
 
     assert float(value(-1)) < float(value(0)) == float(value(1))
 
