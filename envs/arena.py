@@ -162,7 +162,7 @@ def load(source: str) -> str:
     try:
         return reading.text(Path(source))
     except OSError as error:
-        raise EnvError(f"map {_short(source)}: cannot be read: {error.strerror}") from None
+        raise EnvError(f"map {_short(source)}: cannot be read from {Path.cwd()}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise EnvError(f"map {_short(source)}: is not a text file") from None
 

@@ -312,25 +312,27 @@ def compare(rows: Sequence[Mapping[str, Any]], groups: Mapping[str, Sequence[Pat
     """Interquartile means, performance profiles and probabilities of improvement of groups of runs.
 
     A run counts with the last of its checkpoints in `rows`, a score is the success of one seed, and runs are compared
-    on one task, which is an environment with its options.
+    on one task, which is an environment with its options. A group has intervals if it has several seeds of a task.
     """
     last: dict[str, Mapping[str, Any]] = {}
     for row in sorted(rows, key=lambda row: row["env_steps"]):
         last[row["run"]] = row
     found: dict[str, Any] = {"groups": [], "improvement": []}
     scores: dict[str, dict[str, dict[str, list[float]]]] = {}
+    several: dict[str, bool] = {}  # one seed tells nothing of how seeds differ
     for name, runs in groups.items():
         scores[name] = {measure: _scores([last[str(run)] for run in runs], measure) for measure in MEASURES}
         entry: dict[str, Any] = {"name": name, "runs": [str(run) for run in runs]}
+        several[name] = any(len(values) > 1 for values in scores[name][MEASURES[0]].values())
         for measure, tasks in scores[name].items():
             middle, low, high = evaluation.pooled(tasks, evaluation.interquartile_mean)
             share, below, above = evaluation.pooled(tasks, evaluation.profile)
             entry[measure] = {
                 "scores": tasks,
                 "interquartile_mean": float(middle),
-                "interquartile_mean_interval": [float(low), float(high)],
+                "interquartile_mean_interval": [float(low), float(high)] if several[name] else None,
                 "profile": np.round(share, 4).tolist(),
-                "profile_interval": np.round([below, above], 4).tolist(),
+                "profile_interval": np.round([below, above], 4).tolist() if several[name] else None,
             }
         found["groups"].append(entry)
     for better in groups:
@@ -339,7 +341,11 @@ def compare(rows: Sequence[Mapping[str, Any]], groups: Mapping[str, Sequence[Pat
                 pair: dict[str, Any] = {"better": better, "than": than}
                 for measure in MEASURES:
                     chance = evaluation.improvement(scores[better][measure], scores[than][measure])
-                    pair |= {measure: chance and chance[0], f"{measure}_interval": chance and [*chance[1:]]}
+                    known = several[better] and several[than]
+                    pair |= {
+                        measure: chance and chance[0],
+                        f"{measure}_interval": [*chance[1:]] if chance and known else None,
+                    }
                 found["improvement"].append(pair)
     return found
 
@@ -348,9 +354,32 @@ def _scores(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, list[f
     """For each task the scores of all seeds."""
     found: dict[str, list[float]] = {}
     for row in rows:
-        task = " ".join([row["env"], *([json.dumps(row["options"], sort_keys=True)] if row["options"] else [])])
-        found.setdefault(task, []).extend(seed[measure] for seed in row["seeds"])
+        found.setdefault(_task(row["env"], row["options"]), []).extend(seed[measure] for seed in row["seeds"])
     return found
+
+
+def _task(env: str, options: Mapping[str, Any]) -> str:
+    """An environment with its options in one spelling: 4 instead of 4.0, no empty lines around a map."""
+
+    def spelt(value: Any) -> Any:
+        if isinstance(value, str):
+            return "\n".join(line.rstrip() for line in value.strip().splitlines())
+        return int(value) if isinstance(value, float) and value.is_integer() else value
+
+    plain = {key: spelt(value) for key, value in options.items()}
+    return " ".join([env, *([json.dumps(plain, sort_keys=True)] if plain else [])])
+
+
+def check_groups(groups: Mapping[str, Sequence[Path]], configs: Mapping[Path, Config]) -> None:
+    """Raise `ConfigError` if a group holds a seed of a task twice: it would count as two."""
+    for name, runs in groups.items():
+        seen: dict[tuple[str, int], Path] = {}
+        for run in runs:
+            env, settings = configs[run].env, configs[run].trainer
+            for seed in range(settings.seed, settings.seed + settings.num_seeds):
+                other = seen.setdefault((_task(env.name, env.options), seed), run)
+                if other != run:
+                    raise ConfigError(f"--group: {name}: seed {seed} is in {other} and in {run}; allowed: once")
 
 
 def check_place(out: Path, *, force: bool) -> None:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import itertools
 import json
+import re
 import shlex
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -18,7 +21,7 @@ from rich.console import Console
 from envs import reading
 from star.config import Config, ConfigError, TrainerConfig
 from star.loading import fields, load, parse
-from star.stopping import leave
+from star.stopping import at_once, end, leave
 
 if TYPE_CHECKING:
     from star.stretch import Result
@@ -76,6 +79,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0: done, or stopped by SIGTERM with a checkpoint. 2: bad input, or a file that cannot be read or written.
     3: numbers that are not finite. 130: interrupted.
     """
+    ours = arguments is None  # the process is this command's
+    if ours:
+        signal.signal(signal.SIGINT, at_once)
     try:
         code = _run(sys.argv[1:] if arguments is None else list(arguments))
     except ConfigError as error:
@@ -83,6 +89,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = 2
     except KeyboardInterrupt:
         code = 130
+        if ours:
+            end(code)
     return leave(code)
 
 
@@ -94,10 +102,13 @@ def _on_one_line(message: str) -> str:
 
 def _run(arguments: list[str]) -> int:
     words, overrides = split_settings(arguments)
-    parser = _parser()
+    parser, commands = _parser()
     options, unknown = parser.parse_known_args(words)
     for word in unknown:
-        raise ConfigError(f"{word}: unknown argument; settings are given as --section.key VALUE")
+        allowed = re.findall(r"--[a-z-]+", commands[options.command].format_help() if options.command else "")
+        near = difflib.get_close_matches(word.partition("=")[0].replace("_", "-"), allowed, n=1)
+        meant = f" (did you mean {near[0]}?)" if near and word.startswith("-") else ""
+        raise ConfigError(f"{word}: unknown argument{meant}; settings are given as --section.key VALUE")
     if options.command is None:
         parser.print_help()
         return 0
@@ -105,7 +116,8 @@ def _run(arguments: list[str]) -> int:
     return options.function(options, flags | overrides)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
+    """That of `star`, and those of its commands."""
     shape: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
     parser = _Parser(prog="star", description=_HELP, **shape)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
@@ -150,7 +162,7 @@ def _parser() -> argparse.ArgumentParser:
     settings = commands.add_parser("settings", help="list every setting with its default and meaning", **shape)
     settings.add_argument("prefix", nargs="?", default="", help="only settings that begin so, such as tutor")
     settings.set_defaults(function=_settings)
-    return parser
+    return parser, commands.choices
 
 
 def _add_evaluate(evaluate: argparse.ArgumentParser) -> None:
@@ -263,7 +275,7 @@ def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]
             words.append(word)
             continue
         if not equals:
-            if not waiting:
+            if not waiting or waiting[0].startswith("--"):
                 raise ConfigError(f"{word}: needs a value")
             value = waiting.pop(0)
         found[name] = _value(value)
@@ -276,6 +288,13 @@ def _value(text: str) -> Any:
         return reading.plain(text)
     except yaml.YAMLError:
         return text
+
+
+def _new(folder: Path, name: str) -> Path:
+    """A place in `folder` that is named after the time, and is not there yet."""
+    first = folder / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    places = itertools.chain([first], (first.with_name(f"{first.name}-{number}") for number in itertools.count(2)))
+    return next(place for place in places if not place.exists())
 
 
 def _natural(text: str) -> int:
@@ -306,7 +325,7 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     else:
         config = load(options.config, overrides, layers=options.layers)
         name = "-".join(file.stem for file in (options.config, *options.layers))
-        run_dir = options.run_dir or Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+        run_dir = options.run_dir or _new(Path("runs"), name)
 
     if options.debug:
         if config.sgim.enabled:
@@ -363,7 +382,7 @@ def _sweep(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     given = {"trials": options.trials, "batch": options.batch, "study": options.study}
     found = sweep.plan(options.file, settings=overrides, **{key: x for key, x in given.items() if x is not None})
     # workers of one study find the same folder
-    name = found.name if options.storage else f"{options.file.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+    name = found.name if options.storage else _new(Path("sweeps"), options.file.stem).name
     out = options.out or Path("sweeps") / name
     summary = sweep.run(found, out, storage=options.storage, quiet=options.quiet)
     Console().print(sweep_report.table(summary.rows, parameters=list(found.distributions), objective=found.objective))
@@ -390,11 +409,12 @@ def _evaluate(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     from star import assessment
 
     exam = assessment.Exam(grid=_grid(options), seed=options.evaluation_seed, task=task)
+    assessment.check_groups(groups, configs)
     if out is not None:
         assessment.check_place(out, force=options.force)
     targets = [assessment.Target(run, checkpoint, configs[run]) for run, checkpoint in chosen]
     rows = assessment.evaluate(targets, exam, quiet=options.quiet)
-    comparison = assessment.compare(rows, groups) if len(groups) > 1 else None
+    comparison = assessment.compare(rows, groups) if options.group or len(groups) > 1 else None
     written = assessment.write(out, rows, comparison) if out is not None else []
     if options.json:
         for line in [*rows, *([comparison] if comparison else [])]:

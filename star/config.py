@@ -447,7 +447,7 @@ class TrainerConfig(Section):
 
     num_envs: Batch = Field(128, description="environments stepped together, per seed")
     total_env_steps: Annotated[int, Field(gt=0, lt=2**63)] = Field(
-        2_000_000, description="env steps of all environments, per seed"
+        2_000_000, description="env steps of all environments, per seed; the last epoch is finished"
     )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="first seed")
     num_seeds: Annotated[int, Field(gt=0, le=1024)] = Field(

@@ -31,11 +31,12 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers
 
 
 def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """`below` with what `above` says in its place, section by section; task options are replaced as a whole."""
-    merged = dict(below)
+    """`below` with what `above` says in its place, section by section; another task brings options of its own."""
+    another = "name" in above and above["name"] != below.get("name")
+    merged = {key: old for key, old in below.items() if not (another and key in ("options", "training"))}
     for key, value in above.items():
         old = merged.get(key)
-        if isinstance(old, Mapping) and isinstance(value, Mapping) and key not in ("options", "training"):
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
             merged[key] = _merged(old, value)
         else:
             merged[key] = value

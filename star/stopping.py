@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
 from types import FrameType
-from typing import TypeVar
+from typing import NoReturn, TypeVar
 
 T = TypeVar("T")
 
@@ -92,10 +92,24 @@ def computing() -> list[threading.Thread]:
     return [thread for thread in threading.enumerate() if thread.name == _THREAD]
 
 
+def at_once(number: int, frame: FrameType | None) -> None:
+    """Ctrl-C before anything is at stake: `KeyboardInterrupt`, or the end where an import might swallow that."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            os._exit(128 + number)
+        frame = frame.f_back
+    raise KeyboardInterrupt
+
+
 def leave(code: int) -> int:
     """`code`, unless a computation was abandoned: then the process ends here, for Python would crash or wait for it."""
     if computing():
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+        end(code)
     return code
+
+
+def end(code: int) -> NoReturn:
+    """End the process, whatever JAX computes still."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)

@@ -25,6 +25,7 @@ from typing import Any, Literal, Protocol, Self, get_args
 
 from optuna import pruners, samplers
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from optuna.study import get_all_study_names
 from optuna.trial import FrozenTrial, Trial, TrialState
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from rich.console import Console
@@ -237,6 +238,12 @@ def open_ledger(found: Plan, url: str, *, beat_s: int = 15, grace_s: int = 90) -
     )
 
 
+def _check_alone(found: Plan, out: Path, url: str) -> None:
+    for name in get_all_study_names(url):
+        if name != found.name:
+            raise ConfigError(f"{out}: holds the results of the sweep {name}; choose another --out")
+
+
 def run(
     found: Plan, out: Path, *, storage: str | None = None, quiet: bool = False, console: Console | None = None
 ) -> Summary:
@@ -252,6 +259,8 @@ def run(
         _make(out)
     url = storage or f"sqlite:///{database.absolute()}"
     with reachable(url):
+        if storage is None:
+            _check_alone(found, out, url)
         ledger = open_ledger(found, url)
         _make(out)
         with closing(ledger):

@@ -50,7 +50,7 @@ def table(rows: Sequence[Row], *, parameters: Sequence[str], objective: str) -> 
     shown.add_column("trial", justify="right")
     shown.add_column("value", justify="right")
     for name in parameters:
-        shown.add_column(Text(name.replace(".", ".\N{ZERO WIDTH SPACE}")), justify="right", overflow="fold")
+        shown.add_column(Text(name), justify="right", overflow="fold")
     shown.add_column("state")
     for row in ranked[:_SHOWN]:
         state = f"{row['state']}: {row['reason']}" if row["reason"] else row["state"]

@@ -36,7 +36,8 @@ def show(rows: Sequence[Row], comparison: Mapping[str, Any] | None, *, again: st
         print(f"watch a failure: {shlex.join(words)} {again}{' ' * bool(again)}--out failure.html")
     if comparison:
         console.print(groups(comparison["groups"]))
-        console.print(improvements(comparison["improvement"]))
+        if comparison["improvement"]:
+            console.print(improvements(comparison["improvement"]))
 
 
 def evaluations(rows: Sequence[Row]) -> Table:
@@ -65,6 +66,8 @@ def evaluations(rows: Sequence[Row]) -> Table:
 def groups(found: Sequence[Row]) -> Table:
     """Interquartile means of groups of runs."""
     table = Table(box=box.SIMPLE_HEAD, title="interquartile mean over seeds and tasks, 95 % stratified bootstrap")
+    if any(group["success_any"]["interquartile_mean_interval"] is None for group in found):
+        table.caption = "one seed has no interval"
     for name in ("group", "runs", "seeds", "success_any", "success_final"):
         table.add_column(name, justify="left" if name == "group" else "right")
     for group in found:
@@ -107,8 +110,10 @@ def _cells(row: Row) -> list[str]:
 
 
 def _interval(value: float | None, interval: Sequence[float] | None) -> str:
-    """`value [low, high]` of a share, or a dash where there is none."""
-    if value is None or interval is None:
+    """`value [low, high]` of a share, without an interval where there is none, or a dash."""
+    if value is None:
         return "-"
+    if interval is None:
+        return f"{value:.3f}"
     low, high = interval
     return escape(f"{value:.3f} [{low:.3f}, {high:.3f}]")

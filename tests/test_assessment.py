@@ -204,3 +204,9 @@ def test_the_folder_of_an_evaluation_holds_its_rows_and_a_figure_for_everything_
 def test_runs_are_called_by_their_folders_unless_two_are_called_the_same():
     runs = [Path("a/x"), Path("b/x"), Path("c/y")]
     assert report.labels(runs) == ["a/x", "b/x", "y"]
+
+
+def test_one_task_has_one_name_however_it_is_spelt():
+    name = assessment._task
+    assert name("maze", {"cell": 4.0, "map": "111\n1r1\n"}) == name("maze", {"map": "111\n1r1\n\n", "cell": 4})
+    assert name("maze", {"cell": 4.5}) != name("maze", {"cell": 4}) != name("maze", {})

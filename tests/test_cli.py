@@ -114,6 +114,8 @@ def refusal(capsys, folder, arguments):
         pytest.param("train broken.yaml", "broken.yaml: line 3", id="broken config"),
         pytest.param("train point.yaml --bogus", "--bogus: unknown argument", id="unknown flag"),
         pytest.param("train point.yaml --tutor 5", "--tutor: unknown argument", id="flag without a dot"),
+        pytest.param("train point.yaml --run_dir new", "(did you mean --run-dir?)", id="misspelt flag"),
+        pytest.param("train point.yaml --trainer.seed --quiet", "--trainer.seed: needs a value", id="no value"),
         pytest.param("train point.yaml more", "more: unknown argument", id="too many arguments"),
         pytest.param("train", "either a config file or --resume", id="neither config nor resume"),
         pytest.param("train point.yaml --resume runs/old", "either a config file or --resume", id="both"),
@@ -317,6 +319,9 @@ def test_evaluate_prints_a_line_of_json_for_each_checkpoint_on_request(calls, ca
 def test_evaluate_compares_groups_of_runs_and_each_other_run_by_itself(calls, folder, capsys):
     for name in ("a", "b"):
         shutil.copytree(folder / "runs" / "old", folder / "runs" / name)
+    twice = "evaluate --group ours=runs/a,runs/b".split()
+    assert "--group: ours: seed 0 is in runs/a and in runs/b; allowed: once" in refusal(capsys, folder, twice)
+    (folder / "runs" / "b" / "config.yaml").write_text("trainer: {seed: 1}")
     assert main(f"evaluate runs/old --group ours=runs/a,{folder}/runs/b/ --out eval --json".split()) == 0
     lines = capsys.readouterr().out.splitlines()
     comparison = json.loads(lines[-1])
@@ -324,6 +329,8 @@ def test_evaluate_compares_groups_of_runs_and_each_other_run_by_itself(calls, fo
     assert [(group["name"], len(group["runs"])) for group in comparison["groups"]] == [("ours", 2), ("runs/old", 1)]
     assert comparison["groups"][0]["success_any"]["scores"] == {"point_maze": [0.5, 0.5]}
     assert [pair["success_final"] for pair in comparison["improvement"]] == [0.5, 0.5]
+    assert [group["success_any"]["interquartile_mean_interval"] for group in comparison["groups"]] == [[0.5, 0.5], None]
+    assert all(pair["success_any_interval"] is None for pair in comparison["improvement"])  # one seed on one side
     assert (folder / "eval" / "evaluation.jsonl").read_text().splitlines() == lines
     assert {path.name for path in (folder / "eval").iterdir()} == {"evaluation.jsonl", "profile.png"}
     assert "eval/evaluation.jsonl: exists" in refusal(capsys, folder, "evaluate runs/old --out eval".split())

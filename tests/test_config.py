@@ -370,13 +370,15 @@ def test_several_values_of_a_float_run_under_one_vmap():
     assert doubled.tolist() == pytest.approx([10.2, 10.4])
 
 
-def test_layers_replace_only_what_they_name_and_task_options_as_a_whole(write, tmp_path):
+def test_layers_replace_only_what_they_name_and_another_task_brings_its_own_options(write, tmp_path):
     below = write("env: {name: ant_maze, options: {cell: 4}}\ntutor: {unroll: 2, ppo: {clip: 0.1, passes: 2}}")
     layer = tmp_path / "layer.yaml"
     layer.write_text("tutor: {ppo: {clip: 0.3}}\nenv: {options: {goals: test}}")
     got = load(below, {"tutor.ppo.passes": 7}, layers=[layer])
     assert (got.tutor.unroll, got.tutor.ppo.clip, got.tutor.ppo.passes) == (2, 0.3, 7)
-    assert got.env.name == "ant_maze" and got.env.options == {"goals": "test"}
+    assert got.env.name == "ant_maze" and got.env.options == {"cell": 4, "goals": "test"}
+    layer.write_text("env: {name: ant_fall, training: {goals: test}}")
+    assert load(below, layers=[layer]).env.options == {}
 
 
 def test_an_error_names_all_files_it_may_come_from(write, tmp_path):

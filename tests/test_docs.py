@@ -74,6 +74,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr("star.debugging.turn_on", lambda: None)
     monkeypatch.setattr("star.devices.join", lambda cluster: None)
     monkeypatch.setattr(assessment, "evaluate", lambda targets, exam, **_: [])
+    monkeypatch.setattr(assessment, "check_groups", lambda groups, configs: None)
     monkeypatch.setattr(assessment, "compare", lambda rows, groups: None)
     monkeypatch.setattr(tables, "show", lambda rows, comparison, **_: None)
     monkeypatch.setattr(cli, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg

@@ -1,6 +1,9 @@
 import os
 import signal
+import subprocess
+import sys
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -65,3 +68,29 @@ def test_ctrl_c_waits_for_what_is_computed(monkeypatch):
     with interruptible() as stop:
         assert stop.during(lambda: signal.raise_signal(signal.SIGINT) or 7) == 7
         assert stop()
+
+
+def ended(script, tmp_path):
+    """Code and output of a process that runs `script`, with a module `swallows` that hears Ctrl-C while imported."""
+    (tmp_path / "swallows.py").write_text(
+        "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGINT)\nexcept BaseException:\n    pass\n"
+    )
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{Path(__file__).parents[1]}"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False)
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_ctrl_c_ends_a_command_that_imports_still(tmp_path):
+    script = "from star import cli; cli._run = lambda _: __import__('swallows') and 0; cli.main()"
+    assert ended(script, tmp_path) == (130, "")
+
+
+def test_an_interrupted_command_ends_without_taking_python_down_under_what_computes(tmp_path):
+    script = """
+import atexit, os, signal
+from star import cli
+atexit.register(print, "Python was taken down")
+cli._run = lambda _: os.kill(os.getpid(), signal.SIGINT)
+cli.main()
+"""
+    assert ended(script, tmp_path) == (130, "")

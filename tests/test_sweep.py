@@ -336,6 +336,10 @@ def test_the_study_of_another_sweep_is_refused(folder):
     other = plan(written(), settings={"tutor.reward_scale": 0.7})
     with pytest.raises(ConfigError, match=r"study three: is of another sweep, with settings.tutor.reward_scale 0.3"):
         open_ledger(other, "sqlite:///out/sweep.db")
+    before = {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
+    with pytest.raises(ConfigError, match="out: holds the results of the sweep three; choose another --out"):
+        sweep.run(plan(written(study="four")), Path("out"), quiet=True)
+    assert {path: path.read_bytes() for path in before} == before
 
 
 WORKERS = """
