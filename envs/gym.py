@@ -94,7 +94,12 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
-        """Begin an episode. The same seed gives the same start and goal, and so do those drawn from it later."""
+        """Begin an episode. The same seed gives the same start and goal, and so do those drawn from it later.
+
+        Raises:
+          ValueError: in one line, if `options` names any option: there are none.
+        """
+        _check_options(options)
         super().reset(seed=seed)
         everyone = np.ones(1, bool)
         self._state, array = self._program.begin(self._program.blank, everyone, _bits(self.np_random))
@@ -158,7 +163,12 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarra
         self._state: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
-        """Begin all episodes, or those of `options["reset_mask"]` (bool [B]) alone."""
+        """Begin all episodes, or those of `options["reset_mask"]` (bool [B]) alone.
+
+        Raises:
+          ValueError: in one line, if the mask is wrong or `options` names another option.
+        """
+        _check_options(options, "reset_mask")
         super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
         if mask is None:
@@ -301,6 +311,12 @@ def _checked_action(action: Any, space: gymnasium.Space[Any]) -> np.ndarray:
     if action.shape != space.shape:
         raise ValueError(f"the shape of an action is {action.shape}; allowed: {space.shape}")
     return action
+
+
+def _check_options(options: dict[str, Any] | None, *known: str) -> None:
+    for key in options or {}:
+        if key not in known:
+            raise ValueError(f"reset has no option {key!r}; allowed: {', '.join(known) or 'none'}")
 
 
 def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:

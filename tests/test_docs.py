@@ -280,6 +280,22 @@ def test_the_example_of_the_evaluation_page_finds_the_worst_goal(folder):
     assert names["worst"]["cell"] == [4, 0, 8, 4]
 
 
+def test_the_example_of_the_how_to_page_plays_a_trained_agent(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "NAME").symlink_to(run)
+    (example,) = blocks("docs/howto.md", "python")
+    names: dict = {}
+    exec(example, names)
+    path, end = names["path"], names["end"]
+    assert path.shape == (40, 16, 2)
+    assert abs(path[0]).max() <= 0.1 and abs(path[-1]).max() > 1  # the task's start, and the agents move
+    last = jax.numpy.linalg.norm(path[-1] - names["spec"].goal_point(end.env.obs), axis=-1)
+    assert abs(last - end.episode.distance).max() < 1  # an env step later
+    said, *_ = capsys.readouterr().out.splitlines()
+    assert said == f"success at any step: {end.episode.success_any.mean()} at the last: 0.0"
+
+
 def test_the_example_of_the_sgim_page_learns_all_three_exercises_and_asks_the_teacher():
     example, *_ = blocks("docs/sgim.md", "python")
     names: dict = {}

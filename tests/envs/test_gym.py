@@ -237,6 +237,26 @@ def test_what_cannot_be_done_is_told():
             vector.reset(options={"reset_mask": mask})
 
 
+@pytest.mark.parametrize(
+    ("make", "allowed"), [pytest.param(make, "none", id="one"), pytest.param(make_vec, "reset_mask", id="batch")]
+)
+def test_an_option_that_reset_does_not_know_is_told_in_one_line_and_nothing_is_reset(make, allowed):
+    env, other = make(), make()
+    assert same(env.reset(seed=0, options={}), other.reset(seed=0, options=None))
+    with pytest.raises(ValueError, match=f"^reset has no option 'goal'; allowed: {allowed}$"):
+        env.reset(seed=1, options={"goal": [0, 16]})
+    assert same(env.step(act(env)), other.step(act(other)))
+    assert same(env.reset(), other.reset())
+
+
+def test_a_batch_refuses_what_comes_with_a_mask_and_one_environment_the_mask():
+    mask = {"reset_mask": np.ones(B, bool)}
+    with pytest.raises(ValueError, match="'start'"):
+        make_vec().reset(options=mask | {"start": 0})
+    with pytest.raises(ValueError, match="'reset_mask'"):
+        make().reset(options=mask)
+
+
 def test_environments_of_one_kind_are_compiled_once(monkeypatch):
     traced = []
     plain = MazeEnv.step
