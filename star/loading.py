@@ -104,10 +104,23 @@ def fields(section: type[Section] = Config, prefix: str = "") -> Iterator[tuple[
             yield f"{prefix}{name}", field.default, field.description or ""
 
 
+def dotted(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested `values` by their dotted keys, as overrides have them; task options have keys of their own."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
+
+
+def changed(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """What `after` has, by its dotted keys, and `before` has not or not so."""
+    return {key: value for key, value in after.items() if key not in before or before[key] != value}
+
+
 def _with_overrides(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     nested = {key: dict(value) if isinstance(value, Mapping) else value for key, value in values.items()}
-    for dotted, value in overrides.items():
-        *parents, last = dotted.split(".")
+    for key, value in overrides.items():
+        *parents, last = key.split(".")
         level = nested
         for parent in parents:
             child = level.get(parent)

@@ -93,8 +93,8 @@ class Journal:
     """What a run writes down.
 
     `metrics.jsonl` has a line for each epoch and seed, `regions.jsonl` for each evaluation and seed,
-    `provenance.jsonl` for each time that the run began or went on, and `faults.jsonl` for each time that numbers of a
-    seed were not finite.
+    `provenance.jsonl` for each time that the run began or went on, with the `settings` that were not those of
+    `config.yaml` then, and `faults.jsonl` for each time that numbers of a seed were not finite.
     """
 
     metrics: JsonLines

@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata, resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from envs.options import EnvError
 from star import evaluation, report
 from star import program as programs
 from star.config import Config, ConfigError
+from star.loading import changed, dotted, parse
 from star.metrics import Journal, JsonLines, by_step
 
 MAX_POINTS = 300  # of a curve
@@ -38,6 +40,7 @@ MAX_FILM = 1_500_000  # bytes of a film in the page
 
 Row = Mapping[str, Any]
 Kinds = Mapping[str, type | tuple[type, ...]]
+Stretch = tuple[int, Config]  # env steps at its beginning, and what was trained from there on
 
 _OF_SEEDS = frozenset({"trainer.seed", "trainer.num_seeds"})
 _MARK = '<meta name="generator" content="star report">'
@@ -45,14 +48,19 @@ _SMALL_FILM = ("--every", "5", "--fps", "10", "--height", "240")  # about 1 MB f
 _NUMBER = (int, float)
 _METRICS: Kinds = {"seed": int, "env_steps": int, "wall_s": _NUMBER, "env_steps_per_s": _NUMBER}
 _REGIONS: Kinds = {"seed": int, "env_steps": int, "lower": list, "upper": list, "chosen": list}
-_PROVENANCE: Kinds = {"env_steps": int, "time": str, "device": str, "python": str, "versions": dict}
+_PROVENANCE: Kinds = {
+    "env_steps": int, "time": str, "device": str, "python": str, "versions": dict,
+    "settings": (dict, type(None)),  # older runs did not note them
+}  # fmt: skip
+_TOTAL = "trainer.total_env_steps"
 
 
 @dataclass(frozen=True)
 class Run:
     """What a run, or several `together`, left on disk.
 
-    `epochs` are the complete ones: a row for each seed, in the order of the seeds.
+    `epochs` are the complete ones: a row for each seed, in the order of the seeds. `stretches` and `again`, the
+    commands that train the same, have an entry for each of the `paths`.
     """
 
     paths: tuple[Path, ...]
@@ -61,6 +69,8 @@ class Run:
     epochs: list[list[Row]]
     regions: list[Row]
     starts: list[Row]
+    stretches: list[list[Stretch]]
+    again: list[str]
 
     @property
     def seeds(self) -> list[int]:
@@ -107,13 +117,17 @@ def read(run_dir: Path, config: Config, *, name: str) -> Run:
     epochs = _complete(_checked(journal.metrics, _METRICS), seeds)
     if not epochs:
         raise ConfigError(f"{run_dir}: its metrics.jsonl holds no complete epoch, so there is nothing to show yet")
+    starts = _checked(journal.provenance, _PROVENANCE)
+    stretches = _stretches(starts, config, source=str(journal.provenance.path))
     return Run(
         paths=(run_dir,),
         name=name,
         config=config,
         epochs=epochs,
         regions=[row for rows in _complete(_checked(journal.regions, _REGIONS), seeds) for row in rows],
-        starts=_checked(journal.provenance, _PROVENANCE),
+        starts=starts,
+        stretches=[stretches],
+        again=[_again(run_dir, config, stretches)],
     )
 
 
@@ -124,7 +138,7 @@ def together(name: str, runs: Sequence[Run]) -> Run:
       ConfigError: in one line, if they differ in more than their seeds, or two have trained the same seed.
     """
     for run in runs[1:]:
-        differ = {row["key"] for row in differences([runs[0].config, run.config])} - _OF_SEEDS
+        differ = {row["key"] for row in differences([settings(runs[0]), settings(run)])} - _OF_SEEDS
         if differ:
             raise ConfigError(
                 f"--group: {name}: {runs[0].paths[0]} and {run.paths[0]} differ in {min(differ)}; "
@@ -145,7 +159,41 @@ def together(name: str, runs: Sequence[Run]) -> Run:
         epochs=epochs,
         regions=[row for run in runs for row in run.regions if row["env_steps"] <= reached],
         starts=[start for run in runs for start in run.starts],
+        stretches=[stretches for run in runs for stretches in run.stretches],
+        again=[command for run in runs for command in run.again],
     )
+
+
+def _stretches(starts: Sequence[Row], config: Config, *, source: str) -> list[Stretch]:
+    """What is left of each start of a run with this `config.yaml`.
+
+    That is nothing if a later one went on from before it, or if all env steps were done already.
+    """
+    found: list[Stretch] = []
+    for start in starts:
+        began = start["env_steps"]
+        used = parse(config.model_dump(mode="json"), start.get("settings"), source=source)
+        found = [*(stretch for stretch in found if stretch[0] < began), (began, used)]
+    return [(began, used) for began, used in found if began < used.trainer.total_env_steps] or [(0, config)]
+
+
+def _again(run_dir: Path, config: Config, stretches: Sequence[Stretch]) -> str:
+    """The command that trains a run with this `config.yaml` again, and one for each later change of its settings."""
+    tables: list[dict[str, Any]] = []
+    for began, used in stretches:
+        table = dotted(used.model_dump(mode="json"))
+        if tables and not changed(tables[-1], table).keys() - {_TOTAL}:
+            tables.pop()  # longer, but the same
+        elif tables:
+            tables[-1][_TOTAL] = began
+        tables.append(table)
+    copy = f"{run_dir}-again"
+    commands = [["star", "train", str(run_dir / "config.yaml"), "--run-dir", copy]]
+    commands += [["star", "train", "--resume", copy] for _ in tables[1:]]
+    noted = [dotted(config.model_dump(mode="json"))] + [tables[0]] * (len(tables) - 1)
+    for command, before, table in zip(commands, noted, tables, strict=True):
+        command += [word for key, value in changed(before, table).items() for word in (f"--{key}", _worded(value))]
+    return " && ".join(map(shlex.join, commands))
 
 
 def _checked(lines: JsonLines, kinds: Kinds) -> list[Row]:
@@ -172,7 +220,7 @@ def content(runs: Sequence[Run]) -> dict[str, Any]:
     return {
         "made": {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", "version": metadata.version("star-rl")},
         "runs": [_shown(run, most=MAX_BOXES // len(runs)) for run in runs],
-        "settings": differences([run.config for run in runs]),
+        "settings": differences([settings(run) for run in runs]),
     }
 
 
@@ -200,17 +248,16 @@ def facts(run: Run) -> dict[str, Any]:
     best = {name: _table(run.evaluations[-1:], f"eval/{name}") for name in ("success_any", "success_final")}
     return {
         "env_steps": last["env_steps"],
-        "total_env_steps": run.config.trainer.total_env_steps,
+        "total_env_steps": run.stretches[0][-1][1].trainer.total_env_steps,
         "wall_s": last["wall_s"],
         # the first epoch compiles
         "env_steps_per_s": float(np.median(_table(run.epochs[1:] or run.epochs, "env_steps_per_s")[0])),
         "regions": _short(regions.mean(axis=0))[0],
         "path": ", ".join(map(str, run.paths)),
-        "engine": run.config.env.engine,
-        "command": " && ".join(
-            shlex.join(["star", "train", str(path / "config.yaml"), "--run-dir", f"{path}-again"]) for path in run.paths
-        ),
+        "engine": settings(run)["env.engine"],
+        "command": " && ".join(run.again),
         "starts": run.starts,
+        "changes": changes(run),
     } | {name: _short(np.ravel(evaluation.mean_band(table))) or None for name, table in best.items()}
 
 
@@ -308,24 +355,40 @@ def _frame(row: Row, boxes: dict[tuple[float | None, ...], int]) -> dict[str, An
     return frame | {key: _short(row[key]) for key in ("value", "competence") if key in row}
 
 
-def differences(configs: Sequence[Config]) -> list[dict[str, Any]]:
+def changes(run: Run) -> list[dict[str, Any]]:
+    """The settings that were not as before when a run went on or began anew, as {env_steps, key, value}."""
+    found = []
+    for stretches in run.stretches:
+        tables = [dotted(config.model_dump(mode="json")) for config in (run.config, *(used for _, used in stretches))]
+        for (began, _), (before, after) in zip(stretches, pairwise(tables), strict=True):
+            new = {key: value for key, value in changed(before, after).items() if key not in _OF_SEEDS}
+            found += [{"env_steps": began, "key": key, "value": _worded(value)} for key, value in new.items()]
+    return [row for i, row in enumerate(found) if row not in found[:i]]
+
+
+def settings(run: Run) -> dict[str, str]:
+    """The values of all settings in words, with those that were changed later; of the length only the last."""
+    table = words(run.config)
+    for row in changes(run):
+        key, value = row["key"], row["value"]
+        table[key] = value if key == _TOTAL else f"{table[key]}, {value} from {row['env_steps']:,} env steps"
+    return table
+
+
+def words(config: Config) -> dict[str, str]:
+    """The values of all settings in words, by their dotted keys."""
+    return {key: _worded(value) for key, value in dotted(config.model_dump(mode="json")).items()}
+
+
+def differences(tables: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
     """The settings in which runs differ, as {key, values}; for a single run those that differ from the defaults.
 
     The defaults are the last of the `values` then.
     """
-    tables = [_dotted(config.model_dump(mode="json")) for config in configs]
-    if len(tables) == 1:
-        tables.append(_dotted(Config().model_dump(mode="json")))
+    tables = [*tables, words(Config())] if len(tables) == 1 else tables
     keys = {key: None for table in tables for key in table}
-    rows = ({"key": key, "values": [_worded(table.get(key)) for table in tables]} for key in keys)
+    rows = ({"key": key, "values": [table.get(key, "null") for table in tables]} for key in keys)
     return [row for row in rows if len(set(row["values"])) > 1]
-
-
-def _dotted(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, value in values.items():
-        found |= _dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return found
 
 
 def _worded(value: Any) -> str:

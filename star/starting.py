@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from envs import EnvError, files
 from star import checkpoint, devices, lock
 from star import program as programs
 from star.checkpoint import Checkpoints
 from star.config import Config, ConfigError
-from star.loading import load
+from star.loading import changed, dotted, load
 from star.metrics import Journal
 from star.program import Program
 from star.state import TrainState
@@ -43,14 +44,25 @@ def note(run_dir: Path, config: Config) -> None:
         raise ConfigError(str(error)) from None
 
 
+def settings(run_dir: Path, program: Program) -> dict[str, Any]:
+    """The settings of `program` that are not those of the run's `config.yaml`, by their dotted keys."""
+    noted, now = (dotted(config.model_dump(mode="json")) for config in (_noted(run_dir, program), program.config))
+    return changed(noted, now)
+
+
+def _noted(run_dir: Path, program: Program) -> Config:
+    """The config in the folder of a run of the task of `program`."""
+    config = load(run_dir / "config.yaml")
+    return programs.resolve(config, config.env.engine, program.spec)
+
+
 def restored(
     program: Program, checkpoints: Checkpoints, journal: Journal, *, warn: Callable[[str], None]
 ) -> TrainState:
     """The state to go on from, after what was measured later has been dropped. A damaged checkpoint is set aside."""
     run_dir = journal.metrics.path.parent
     if not checkpoints.steps():
-        noted = programs.resolve(load(run_dir / "config.yaml"), program.config.env.engine, program.spec)
-        for key, old, new in checkpoint.differences(noted, program.config):
+        for key, old, new in checkpoint.differences(_noted(run_dir, program), program.config):
             raise ConfigError(f"{run_dir}: was begun with {key} {old}, not {new}")
         warn(f"{run_dir}: holds no checkpoint, so it begins anew")
         journal.keep_until(0)

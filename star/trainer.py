@@ -57,12 +57,15 @@ def train(
     with interruptible() as stop, alone, closing(checkpoints):
         stop.patient = jax.process_count() > 1  # the others would wait for ever for one that leaves an epoch
         if resume:
+            settings = starting.settings(run_dir, program)
             state = starting.restored(program, checkpoints, journal, warn=warn)
         else:
+            settings = {}
             starting.note(run_dir, program.config)
             state = program.init(program.seed_keys())
         began = _epochs(state) * program.env_steps_per_epoch
-        journal.provenance.write({"env_steps": began} | provenance.here(devices=config.trainer.devices))
+        here = provenance.here(devices=config.trainer.devices)
+        journal.provenance.write({"env_steps": began, "settings": settings} | here)
         if config.trainer.on_non_finite == "rollback" and not checkpoints.steps():
             checkpoints.save(0, state, program.config, success=0.0)  # there is always one to go back to
         records = Records(program, journal)

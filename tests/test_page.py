@@ -3,6 +3,7 @@
 import json
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -47,9 +48,12 @@ def strip(number, *, old=False):
 
 @pytest.fixture
 def make(tmp_path):
-    """Writes a run directory; four epochs, two evaluations and two seeds if not told otherwise."""
+    """Writes a run directory; four epochs, two evaluations and two seeds if not told otherwise.
 
-    def write(name="run", *, seeds=(0, 1), rows=None, regions=None, settings=None):
+    `resumed` has (env steps, what else its line of provenance says) of each time that the run went on.
+    """
+
+    def write(name="run", *, seeds=(0, 1), rows=None, regions=None, settings=None, resumed=()):
         folder = tmp_path / name
         folder.mkdir(parents=True)
         config = parse({"trainer": {"num_seeds": len(seeds), "total_env_steps": 400}}, settings)
@@ -58,7 +62,8 @@ def make(tmp_path):
         grown = [{"seed": seed, "env_steps": 100 * n} | strip(n // 2) for n in (2, 4) for seed in seeds]
         lines(folder / "regions.jsonl", grown if regions is None else regions)
         start = {"time": "2026-01-02T03:04:05+00:00", "commit": "c0ffee", "device": "abacus", "python": "3.11.0"}
-        lines(folder / "provenance.jsonl", [{"env_steps": 0} | start | {"versions": {"jax": "0.10"}}])
+        start |= {"versions": {"jax": "0.10"}}
+        lines(folder / "provenance.jsonl", [{"env_steps": n} | start | more for n, more in [(0, {}), *resumed]])
         return folder
 
     return write
@@ -149,6 +154,7 @@ def test_many_moments_are_thinned_evenly_and_keep_the_first_and_the_last(make):
 
 def test_only_settings_that_differ_are_listed():
     one, other = parse({}), parse({"tutor": {"period": 5}, "env": {"options": {"cell": 4.0}}})
+    one, other = page.words(one), page.words(other)
     differ = page.differences([one, other, one])
     assert {row["key"]: row["values"] for row in differ} == {
         "tutor.period": ["10", "5", "10"],
@@ -163,9 +169,68 @@ def test_runs_of_the_same_name_are_told_apart_by_their_paths(make):
     assert report.labels(paths) == [str(paths[0]), str(paths[1]), "c"]
 
 
-def alone(make, name, *seeds, **settings):
+OTHER = {"settings": {"commander.practice": 0.0}}
+LONGER = {"settings": {"trainer.total_env_steps": 800}}
+BOTH = {"settings": OTHER["settings"] | LONGER["settings"]}
+AS_BEFORE = {"settings": {}}
+FIRST, THEN = "star train run/config.yaml --run-dir run-again", "star train --resume run-again"
+PRACTICE, TOTAL = "--commander.practice", "--trainer.total_env_steps"
+
+
+@pytest.mark.parametrize(
+    ("resumed", "total", "changed", "again"),
+    [
+        ([], 400, [], FIRST),
+        ([(200, {})], 400, [], FIRST),  # by an older version
+        ([(200, AS_BEFORE)], 400, [], FIRST),
+        ([(200, AS_BEFORE), (400, LONGER)], 800, [(400, TOTAL, "800")], f"{FIRST} {TOTAL} 800"),
+        ([(400, LONGER), (800, AS_BEFORE)], 800, [(400, TOTAL, "800")], f"{FIRST} {TOTAL} 800"),  # was over already
+        (
+            [(400, BOTH)],
+            800,
+            [(400, PRACTICE, "0.0"), (400, TOTAL, "800")],
+            f"{FIRST} && {THEN} {PRACTICE} 0.0 {TOTAL} 800",
+        ),
+        (
+            [(200, OTHER), (300, AS_BEFORE)],
+            400,
+            [(200, PRACTICE, "0.0"), (300, PRACTICE, "0.5")],
+            f"{FIRST} {TOTAL} 200 && {THEN} {PRACTICE} 0.0 {TOTAL} 300 && {THEN} {TOTAL} 400",
+        ),
+        ([(200, OTHER), (200, AS_BEFORE)], 400, [], FIRST),  # killed before a checkpoint
+        ([(0, OTHER)], 400, [(0, PRACTICE, "0.0")], f"{FIRST} {PRACTICE} 0.0"),
+    ],
+)
+def test_settings_changed_on_resume_are_told_and_trained_again(make, monkeypatch, resumed, total, changed, again):
+    monkeypatch.chdir(make(settings={"commander.practice": 0.5}, resumed=resumed).parent)
+    facts = page.facts(read(Path("run")))
+    assert facts["total_env_steps"] == total
+    assert [(row["env_steps"], f"--{row['key']}", row["value"]) for row in facts["changes"]] == changed
+    assert facts["command"] == again
+
+
+def test_settings_changed_on_resume_are_among_those_that_differ(make):
+    first, second = read(make("first", resumed=[(400, BOTH)])), read(make("second"))
+    before = page.words(second.config)["commander.practice"]
+    assert page.content([first, second])["settings"] == [
+        {"key": "commander.practice", "values": [f"{before}, 0.0 from 400 env steps", before]},
+        {"key": "trainer.total_env_steps", "values": ["800", "400"]},
+    ]
+
+
+def test_seeds_that_went_on_with_other_settings_are_not_those_of_one_run(make):
+    paths = [alone(make, name, seed, resumed=[(200, LONGER)]) for seed, name in enumerate("ab")]
+    both = page.together("both", [read(path) for path in paths])
+    assert [(row["env_steps"], row["key"]) for row in page.changes(both)] == [(200, "trainer.total_env_steps")]
+    assert "trainer.seed" not in page.facts(both)["command"]
+    other = read(alone(make, "other", 2, resumed=[(200, BOTH)]))
+    with pytest.raises(ConfigError, match="differ in commander.practice; "):
+        page.together("all", [both, other])
+
+
+def alone(make, name, *seeds, resumed=(), **settings):
     settings = {f"trainer.{key}": value for key, value in settings.items()} | {"trainer.seed": seeds[0]}
-    return make(name, seeds=seeds, settings=settings)
+    return make(name, seeds=seeds, settings=settings, resumed=resumed)
 
 
 def test_seeds_that_were_trained_one_by_one_are_shown_like_seeds_side_by_side(make, tmp_path):
@@ -233,6 +298,9 @@ def test_the_newest_small_film_is_shown_and_else_how_to_make_one(make, monkeypat
     assert "a.gif" in page.film(folder)["large"]
 
 
+START = '{"env_steps": 0, "time": "", "device": "", "python": "", "versions": {}, "settings": %s}\n'
+
+
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
@@ -248,6 +316,8 @@ def test_the_newest_small_film_is_shown_and_else_how_to_make_one(make, monkeypat
             "regions.jsonl: line 1: its lists differ in length",
         ),
         ("provenance", "{}\n", "provenance.jsonl: line 1: env_steps is null"),
+        ("provenance", START % "[1]", "provenance.jsonl: line 1: settings is [1], which no run writes"),
+        ("provenance", START % '{"tutor.speed": 1}', "provenance.jsonl: tutor.speed: unknown key"),
     ],
 )
 def test_a_file_that_no_run_writes_is_refused_in_one_line_that_says_where(make, name, text, said):
@@ -379,6 +449,14 @@ def test_success_can_be_seen_over_the_wall_clock(browser, two):
     assert "env steps" in text(browser, "#success svg") and "wall-clock" not in text(browser, "#success svg")
     browser.run("document.querySelector('#success input[value=wall_s]').click()")
     assert "wall-clock, s" in text(browser, "#success svg") and count(browser, "#success .band") == 2
+
+
+def test_the_table_of_provenance_says_what_was_changed_on_resume(browser, make, tmp_path):
+    folders = make("one", resumed=[(200, AS_BEFORE), (300, OTHER)]), make("two", resumed=[(200, AS_BEFORE)])
+    page.write({folder: load(folder / "config.yaml") for folder in folders}, tmp_path / "report.html")
+    browser.open(tmp_path / "report.html")
+    row = "changed on resumecommander.practice 0.0 from 300 env stepsnothing"
+    assert row in text(browser, "#provenance") and browser.problems == []
 
 
 def test_a_single_run_has_its_value_map_with_the_plan_beside_what_was_chosen(browser, make, tmp_path):

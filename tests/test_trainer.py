@@ -146,11 +146,15 @@ def test_the_figure_of_growth_shows_the_regions_at_the_moments_asked_for(tmp_pat
 def test_a_run_notes_each_time_it_begins_with_what_and_where(finished, tmp_path):
     run_dir, _ = finished
     (start,) = Journal.of(run_dir).provenance.read()
-    assert start["env_steps"] == 0 and start["device"].startswith("CPU, ")
+    assert (start["env_steps"], start["settings"]) == (0, {}) and start["device"].startswith("CPU, ")
     assert start["versions"]["jax"] == jax.__version__
     shutil.copytree(run_dir, tmp_path / "run")
-    trainer.train(tiny(), tmp_path / "run", resume=True, quiet=True)
-    assert [row["env_steps"] for row in Journal.of(tmp_path / "run").provenance.read()] == [0, 4 * EPOCH]
+    for changed in ({}, {"tutor__reward_scale": 3.0, "trainer__sinks": []}):
+        trainer.train(tiny(**changed), tmp_path / "run", resume=True, quiet=True)
+    noted = [(row["env_steps"], row["settings"]) for row in Journal.of(tmp_path / "run").provenance.read()]
+    other = {"tutor.reward_scale": 3.0, "trainer.sinks": []}
+    assert noted == [(0, {}), (4 * EPOCH, {}), (4 * EPOCH, other)]
+    assert (tmp_path / "run" / "config.yaml").read_bytes() == (run_dir / "config.yaml").read_bytes()
 
 
 def test_seeds_differ(finished):

@@ -551,6 +551,12 @@ function films() {
   })));
 }
 
+function changed({ facts }) {
+  const all = facts.changes.map(({ key, value, env_steps }) =>
+    `${key} ${value} from ${env_steps.toLocaleString("en")} env steps`).join("; ");
+  return all || (facts.starts.at(-1)?.settings ? "nothing" : "");
+}
+
 function provenance() {
   const facts = [
     ["run", run => html("code", {}, run.facts.path)],
@@ -565,6 +571,7 @@ function provenance() {
     ["Python", run => [...new Set(run.facts.starts.map(start => start.python))].join("; ")],
     ["packages", run => [...new Set(run.facts.starts.map(({ versions }) =>
       Object.entries(versions).map(([name, version]) => `${name} ${version}`).join(", ")))].join("; ")],
+    ...(runs.some(run => run.facts.changes.length) ? [["changed on resume", changed]] : []),
     ["the same again", run => html("code", {}, run.facts.command)],
   ];
   const rows = facts.map(([name, cell]) => [name, ...runs.map(run => cell(run) || "not recorded")]);
