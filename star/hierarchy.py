@@ -61,7 +61,7 @@ def epoch(
         (jax.random.split(scan_key, blocks[0]), jnp.arange(segments).reshape(blocks)),
     )
     metrics = jax.tree.map(jnp.mean, metrics) | jax.tree.map(jnp.sum, counts)
-    metrics |= _episode_metrics("train", streams.episode, streams.practice < 0)
+    metrics |= _episode_metrics("train", streams.episode, (streams.practice < 0).astype(jnp.float32))
     if config.sgim.enabled:
         state, more = _end_lesson(config, spec, state, streams)
         metrics |= _prefix("sgim", more)

@@ -56,7 +56,7 @@ def flatten(batch: Any) -> Any:
 
 
 def weighted_mean(x: Float[Array, "*n"], weight: Float[Array, "*n"]) -> Float[Array, ""]:
-    """Mean of `x` where `weight` is 1 of 0 and 1; 0 where there is none."""
+    """Mean of `x` where `weight` is 1 and not 0; 0 if there is nothing of weight 1."""
     return jnp.sum(x * weight) / jnp.maximum(weight.sum(), 1.0)
 
 
