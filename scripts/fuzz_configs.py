@@ -33,6 +33,7 @@ import sys
 import tempfile
 import time
 import traceback
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -524,7 +525,11 @@ def fuzz(count: int, seed: int, *, limit: int, tell: Callable[[Case, Trial], Non
     def each(case: Case) -> None:
         tell(case, run(case, limit=limit))
 
-    each()
+    with warnings.catch_warnings():  # threads of what ran before may draw random numbers while a case is made
+        warnings.filterwarnings(
+            "ignore", "Do not use the `random` module", hypothesis.errors.HypothesisDeprecationWarning
+        )
+        each()
 
 
 def main() -> int:
