@@ -339,9 +339,9 @@ def compare(rows: Sequence[Mapping[str, Any]], groups: Mapping[str, Sequence[Pat
         for than in groups:
             if better != than:
                 pair: dict[str, Any] = {"better": better, "than": than}
+                known = several[better] and several[than]
                 for measure in MEASURES:
                     chance = evaluation.improvement(scores[better][measure], scores[than][measure])
-                    known = several[better] and several[than]
                     pair |= {
                         measure: chance and chance[0],
                         f"{measure}_interval": [*chance[1:]] if chance and known else None,
@@ -376,8 +376,9 @@ def check_groups(groups: Mapping[str, Sequence[Path]], configs: Mapping[Path, Co
         seen: dict[tuple[str, int], Path] = {}
         for run in runs:
             env, settings = configs[run].env, configs[run].trainer
+            task = _task(env.name, env.options)
             for seed in range(settings.seed, settings.seed + settings.num_seeds):
-                other = seen.setdefault((_task(env.name, env.options), seed), run)
+                other = seen.setdefault((task, seed), run)
                 if other != run:
                     raise ConfigError(f"--group: {name}: seed {seed} is in {other} and in {run}; allowed: once")
 

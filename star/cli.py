@@ -382,8 +382,8 @@ def _sweep(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     given = {"trials": options.trials, "batch": options.batch, "study": options.study}
     found = sweep.plan(options.file, settings=overrides, **{key: x for key, x in given.items() if x is not None})
     # workers of one study find the same folder
-    name = found.name if options.storage else _new(Path("sweeps"), options.file.stem).name
-    out = options.out or Path("sweeps") / name
+    folder = Path("sweeps")
+    out = options.out or (folder / found.name if options.storage else _new(folder, options.file.stem))
     summary = sweep.run(found, out, storage=options.storage, quiet=options.quiet)
     Console().print(sweep_report.table(summary.rows, parameters=list(found.distributions), objective=found.objective))
     if not summary.finished:

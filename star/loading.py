@@ -104,11 +104,15 @@ def fields(section: type[Section] = Config, prefix: str = "") -> Iterator[tuple[
             yield f"{prefix}{name}", field.default, field.description or ""
 
 
-def dotted(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested `values` by their dotted keys, as overrides have them; task options have keys of their own."""
+def dotted(config: Config) -> dict[str, Any]:
+    """The settings of `config` by their dotted keys, as overrides have them; task options have keys of their own."""
+    return _flat(config.model_dump(mode="json"))
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in values.items():
-        found |= dotted(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return found
 
 

@@ -181,7 +181,7 @@ def _again(run_dir: Path, config: Config, stretches: Sequence[Stretch]) -> str:
     """The command that trains a run with this `config.yaml` again, and one for each later change of its settings."""
     tables: list[dict[str, Any]] = []
     for began, used in stretches:
-        table = dotted(used.model_dump(mode="json"))
+        table = dotted(used)
         if tables and not changed(tables[-1], table).keys() - {_TOTAL}:
             tables.pop()  # longer, but the same
         elif tables:
@@ -190,7 +190,7 @@ def _again(run_dir: Path, config: Config, stretches: Sequence[Stretch]) -> str:
     copy = f"{run_dir}-again"
     commands = [["star", "train", str(run_dir / "config.yaml"), "--run-dir", copy]]
     commands += [["star", "train", "--resume", copy] for _ in tables[1:]]
-    noted = [dotted(config.model_dump(mode="json"))] + [tables[0]] * (len(tables) - 1)
+    noted = [dotted(config)] + [tables[0]] * (len(tables) - 1)
     for command, before, table in zip(commands, noted, tables, strict=True):
         command += [word for key, value in changed(before, table).items() for word in (f"--{key}", _worded(value))]
     return " && ".join(map(shlex.join, commands))
@@ -359,7 +359,7 @@ def changes(run: Run) -> list[dict[str, Any]]:
     """The settings that were not as before when a run went on or began anew, as {env_steps, key, value}."""
     found = []
     for stretches in run.stretches:
-        tables = [dotted(config.model_dump(mode="json")) for config in (run.config, *(used for _, used in stretches))]
+        tables = [dotted(config) for config in (run.config, *(used for _, used in stretches))]
         for (began, _), (before, after) in zip(stretches, pairwise(tables), strict=True):
             new = {key: value for key, value in changed(before, after).items() if key not in _OF_SEEDS}
             found += [{"env_steps": began, "key": key, "value": _worded(value)} for key, value in new.items()]
@@ -377,7 +377,7 @@ def settings(run: Run) -> dict[str, str]:
 
 def words(config: Config) -> dict[str, str]:
     """The values of all settings in words, by their dotted keys."""
-    return {key: _worded(value) for key, value in dotted(config.model_dump(mode="json")).items()}
+    return {key: _worded(value) for key, value in dotted(config).items()}
 
 
 def differences(tables: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:

@@ -46,8 +46,7 @@ def note(run_dir: Path, config: Config) -> None:
 
 def settings(run_dir: Path, program: Program) -> dict[str, Any]:
     """The settings of `program` that are not those of the run's `config.yaml`, by their dotted keys."""
-    noted, now = (dotted(config.model_dump(mode="json")) for config in (_noted(run_dir, program), program.config))
-    return changed(noted, now)
+    return changed(dotted(_noted(run_dir, program)), dotted(program.config))
 
 
 def _noted(run_dir: Path, program: Program) -> Config:
