@@ -164,8 +164,8 @@ def _native(model: mujoco.MjModel, frames: int) -> StepBatch:
 
 def _jax(model: mujoco.MjModel, frames: int) -> StepBatch:
     """MJX in JAX, whose contact buffers cannot be too small."""
-    device_model = mjx.put_model(model, impl="jax")
-    blank = mjx.make_data(model, impl="jax")
+    device_model = mjx.put_model(model, impl="jax", device=_here())
+    blank = mjx.make_data(model, impl="jax", device=_here())
 
     def step(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         return _mjx_step(device_model, blank, frames, lambda _: jnp.zeros(()), data, ctrl)
@@ -178,7 +178,7 @@ def _warp(model: mujoco.MjModel, frames: int) -> StepBatch:
     import warp
 
     warp.config.log_level = warp.LOG_WARNING  # it would report every kernel that it compiles
-    device_model = mjx.put_model(model, impl="warp").tree_replace({"opt._impl.warn_overflow": 0})
+    device_model = mjx.put_model(model, impl="warp", device=_here()).tree_replace({"opt._impl.warn_overflow": 0})
 
     slides = int((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE).sum())
     contacts = CONTACTS + slides * SLIDE_CONTACTS
@@ -189,10 +189,16 @@ def _warp(model: mujoco.MjModel, frames: int) -> StepBatch:
 
     def step(data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
         with jax.ensure_compile_time_eval():
-            blank = mjx.make_data(model, impl="warp", naconmax=max(len(ctrl) * contacts, MIN_POOL), njmax=rows)
+            pool = max(len(ctrl) * contacts, MIN_POOL)
+            blank = mjx.make_data(model, impl="warp", device=_here(), naconmax=pool, njmax=rows)
         return _mjx_step(device_model, jax.tree.map(_as_fill, blank), frames, overflow, data, ctrl)
 
     return step
+
+
+def _here() -> jax.Device:
+    """A device whose arrays this process can read, as compiling them in needs; MJX would take the first of all."""
+    return jax.local_devices()[0]
 
 
 def _as_fill(leaf: jax.Array) -> jax.Array:

@@ -67,8 +67,10 @@ assert [float(shard.data[0]) for shard in same.addressable_shards] == [1.0] * 4
 PROCESS = """
 import sys
 from pathlib import Path
-import jax, jax.numpy as jnp, numpy as np
+import jax, jax.numpy as jnp, mujoco, numpy as np
 from envs import VectorEnv, make
+from envs.batching import shared_out
+from envs.physics import Physics
 from star import devices
 from star.checkpoint import Checkpoints
 from star.config import Config
@@ -79,11 +81,17 @@ devices.join(f"{address},{number},2")
 assert devices.first() == (number == 0)
 mesh = devices.mesh(2)
 batch = VectorEnv(make("point_maze"), 4, auto_reset=False)
+falling = '<mujoco><worldbody><body><joint type="slide" axis="0 0 1"/><geom size="1"/></body></worldbody></mujoco>'
+physics = Physics(mujoco.MjModel.from_xml_string(falling), engine="jax", frames=1)
+
+def fall(height):
+    return physics.step(physics.init(height, jnp.zeros(1)), jnp.zeros(0)).qpos
 
 def walk(key):
     state = devices.share(batch.reset(key))
     state = batch.step(state, jnp.ones((4, 2)))
-    return {"far": devices.whole(state.obs)}
+    fallen = jax.vmap(shared_out(jax.vmap(fall)))(devices.share(jnp.ones((1, 4, 1)), axis=1))
+    return {"far": devices.whole(state.obs), "fallen": devices.whole(fallen)}
 
 state = jax.jit(devices.on(mesh, walk), out_shardings=devices.everywhere(mesh))(jax.random.key(3))
 Journal.of(folder, muted=not devices.first()).metrics.write({"process": number})
@@ -94,6 +102,7 @@ checkpoints.close()
 devices.wait("the end")
 assert (folder / "metrics.jsonl").read_text() == '{"process": 0}\\n'
 np.save(folder / f"{number}.npy", jax.device_get(state)["far"])
+assert (0.99 < state["fallen"]).all() and (state["fallen"] < 1).all()
 """
 
 
@@ -132,7 +141,8 @@ def test_two_processes_step_one_batch_and_the_first_alone_writes(tmp_path):
     for number in range(2):
         np.testing.assert_allclose(np.load(tmp_path / f"{number}.npy"), alone, rtol=1e-6)
     checkpoints = Checkpoints(tmp_path)
-    np.testing.assert_allclose(checkpoints.restore(1, {"far": alone})["far"], alone, rtol=1e-6)
+    assert checkpoints.arrays(1)["fallen"].shape == (1, 4, 1)
+    np.testing.assert_allclose(checkpoints.arrays(1)["far"], alone, rtol=1e-6)
     checkpoints.close()
 
 
