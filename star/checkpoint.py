@@ -42,6 +42,7 @@ SUMS = "SHA256SUMS"
 _ABOUT = "about.json"
 _WRITING, _LEAVING = ".partial", ".removed"  # hidden folders that a process which was killed may leave
 _ASIDE = ".damaged"
+_M_MMAP_THRESHOLD = -3  # of glibc
 _HARMLESS = (
     "env.engine",
     "trainer.total_env_steps",
@@ -82,7 +83,8 @@ class Checkpoints:
                 self._clean()
                 writing.mkdir()
             devices.wait("there is a folder to write to")
-            self._open().save(writing.absolute() / "state", args=ocp.args.StandardSave(plain(state)))
+            with _memory_given_back():
+                self._open().save(writing.absolute() / "state", args=ocp.args.StandardSave(plain(state)))
             if devices.first():
                 text = json.dumps(about | {"config": config.model_dump(mode="json")}, indent=1)
                 (writing / _ABOUT).write_text(text + "\n", encoding="utf-8")
@@ -93,7 +95,6 @@ class Checkpoints:
                 os.rename(writing, target)
                 files.sync(self._path)
                 self._retire(env_steps)
-            _give_memory_back()
             devices.wait("the checkpoint is there")
         except (OSError, ValueError, RuntimeError) as error:  # of all these kinds are those of the library that writes
             shutil.rmtree(writing, ignore_errors=True)
@@ -393,10 +394,26 @@ def _sums(path: Path) -> str:
     return "".join(lines)
 
 
-def _give_memory_back() -> None:
-    """What the many threads that write have freed, glibc keeps for each: on 32 cores 20 MiB more every time."""
-    with contextlib.suppress(OSError, AttributeError):  # another C library
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
+@contextlib.contextmanager
+def _memory_given_back() -> Iterator[None]:
+    """Return to the system what is freed meanwhile.
+
+    glibc would keep it: orbax's threads use heaps by turns, of which there are 256 on 32 cores, and each of them stays
+    as large as it once was. So blocks of 64 KiB and more are mapped, not taken from a heap. Without it the process
+    grows by 2.4 MiB with each of the first 40 checkpoints of 13 MiB, with it by .4, and then by .1.
+    """
+    try:
+        libc = ctypes.CDLL("libc.so.6")
+        mallopt, trim = libc.mallopt, libc.malloc_trim
+    except (OSError, AttributeError):  # another C library
+        yield
+        return
+    mallopt(_M_MMAP_THRESHOLD, 64 * 1024)
+    try:
+        yield
+    finally:
+        mallopt(_M_MMAP_THRESHOLD, 32 * 1024**2)  # the largest there is, which glibc itself comes to in time
+        trim(0)
 
 
 def _cause(error: Exception) -> str:
