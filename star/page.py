@@ -1,8 +1,6 @@
 """The report: runs as one HTML page that needs no network and no other file.
 
-    read      what a run left on disk
-    together  runs that differ in their seeds alone, as one
-    content   what the page shows of it, as plain values: curves thinned and summarised, regions at some moments
+    content   what it shows of runs, as plain values: curves thinned and summarised, regions at some moments
     write     star/assets/report.html with its style, its script and these values as JSON in it
 
 All that a user may have named reaches the page as JSON and is drawn as text, never as markup.
@@ -16,10 +14,8 @@ import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata, resources
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,65 +24,23 @@ import numpy as np
 from envs import files, video
 from envs.arena import ROBOT
 from envs.options import EnvError
-from star import evaluation, report
+from star import evaluation, history, report
 from star import program as programs
 from star.config import Config, ConfigError
-from star.loading import changed, dotted, parse
-from star.metrics import Journal, JsonLines, by_step
+from star.history import NUMBER, Row, Run
 
 MAX_POINTS = 300  # of a curve
 MAX_BOXES = 24_000  # regions of all runs in all frames together
 MAX_FILM = 1_500_000  # bytes of a film in the page
 
-Row = Mapping[str, Any]
-Kinds = Mapping[str, type | tuple[type, ...]]
-Stretch = tuple[int, Config]  # env steps at its beginning, and what was trained from there on
-
-_OF_SEEDS = frozenset({"trainer.seed", "trainer.num_seeds"})
 _MARK = '<meta name="generator" content="star report">'
 _SMALL_FILM = ("--every", "5", "--fps", "10", "--height", "240")  # about 1 MB for an episode of 500 env steps
-_NUMBER = (int, float)
-_METRICS: Kinds = {"seed": int, "env_steps": int, "wall_s": _NUMBER, "env_steps_per_s": _NUMBER}
-_REGIONS: Kinds = {"seed": int, "env_steps": int, "lower": list, "upper": list, "chosen": list}
-_PROVENANCE: Kinds = {
-    "env_steps": int, "time": str, "device": str, "python": str, "versions": dict,
-    "settings": (dict, type(None)),  # older runs did not note them
-}  # fmt: skip
-_TOTAL = "trainer.total_env_steps"
-
-
-@dataclass(frozen=True)
-class Run:
-    """What a run, or several `together`, left on disk.
-
-    `epochs` are the complete ones: a row for each seed, in the order of the seeds. `stretches` and `again`, the
-    commands that train the same, have an entry for each of the `paths`.
-    """
-
-    paths: tuple[Path, ...]
-    name: str
-    config: Config
-    epochs: list[list[Row]]
-    regions: list[Row]
-    starts: list[Row]
-    stretches: list[list[Stretch]]
-    again: list[str]
-
-    @property
-    def seeds(self) -> list[int]:
-        """The seeds trained side by side."""
-        return [row["seed"] for row in self.epochs[0]]
-
-    @property
-    def evaluations(self) -> list[list[Row]]:
-        """The epochs in which the seeds were evaluated."""
-        return [rows for rows in self.epochs if all("eval/success_final" in row for row in rows)]
 
 
 def write(runs: Mapping[Path, Config], out: Path, *, groups: Mapping[str, Sequence[Path]] | None = None) -> str:
     """Write the report of `runs` (directory: configuration) to `out`; returns a line that says what was written.
 
-    Those of each of the `groups` are shown `together`, before the others. An existing file is replaced.
+    Those of each of the `groups` are shown as one run, before the others. An existing file is replaced.
 
     Raises:
       ConfigError: in one line, if a run, a group or `out` cannot be used; nothing is written then.
@@ -94,10 +48,10 @@ def write(runs: Mapping[Path, Config], out: Path, *, groups: Mapping[str, Sequen
     programs.select_device("cpu")  # a GPU may be busy with one of the runs
     try:
         found = {
-            path: read(path, config, name=name)
+            path: history.read(path, config, name=name)
             for (path, config), name in zip(runs.items(), report.labels(list(runs)), strict=True)
         }
-        merged = [together(name, [found.pop(path) for path in paths]) for name, paths in (groups or {}).items()]
+        merged = [history.together(name, [found.pop(path) for path in paths]) for name, paths in (groups or {}).items()]
         page = html(content([*merged, *found.values()]))
         with files.whole(out) as partial:
             partial.write_text(page, encoding="utf-8")
@@ -106,121 +60,12 @@ def write(runs: Mapping[Path, Config], out: Path, *, groups: Mapping[str, Sequen
     return f"{out}: {len(runs)} run{'s' * (len(runs) > 1)}, {out.stat().st_size / 1e6:.1f} MB; open it in a browser"
 
 
-def read(run_dir: Path, config: Config, *, name: str) -> Run:
-    """The complete lines of a run, which may still be going on.
-
-    Raises:
-      ConfigError: in one line, if there is no complete epoch yet, or a line is not what a run writes.
-    """
-    journal = Journal.of(run_dir)
-    seeds = config.trainer.num_seeds
-    epochs = _complete(_checked(journal.metrics, _METRICS), seeds)
-    if not epochs:
-        raise ConfigError(f"{run_dir}: its metrics.jsonl holds no complete epoch, so there is nothing to show yet")
-    starts = _checked(journal.provenance, _PROVENANCE)
-    stretches = _stretches(starts, config, source=str(journal.provenance.path))
-    return Run(
-        paths=(run_dir,),
-        name=name,
-        config=config,
-        epochs=epochs,
-        regions=[row for rows in _complete(_checked(journal.regions, _REGIONS), seeds) for row in rows],
-        starts=starts,
-        stretches=[stretches],
-        again=[_again(run_dir, config, stretches)],
-    )
-
-
-def together(name: str, runs: Sequence[Run]) -> Run:
-    """The seeds of several runs as those of one, as far as all have come.
-
-    Raises:
-      ConfigError: in one line, if they differ in more than their seeds, or two have trained the same seed.
-    """
-    for run in runs[1:]:
-        differ = {row["key"] for row in differences([settings(runs[0]), settings(run)])} - _OF_SEEDS
-        if differ:
-            raise ConfigError(
-                f"--group: {name}: {runs[0].paths[0]} and {run.paths[0]} differ in {min(differ)}; "
-                f"allowed: the same settings but for {' and '.join(sorted(_OF_SEEDS))}"
-            )
-    seeds = [seed for run in runs for seed in run.seeds]
-    for seed in seeds:
-        if seeds.count(seed) > 1:
-            raise ConfigError(f"--group: {name}: seed {seed} is in several of its runs; allowed: once")
-    epochs = _complete([row for run in runs for epoch in run.epochs for row in epoch], len(seeds))
-    if not epochs:
-        raise ConfigError(f"--group: {name}: its runs have no epoch in common, so there is nothing to show yet")
-    reached = epochs[-1][0]["env_steps"]
-    return Run(
-        paths=tuple(path for run in runs for path in run.paths),
-        name=name,
-        config=runs[0].config,
-        epochs=epochs,
-        regions=[row for run in runs for row in run.regions if row["env_steps"] <= reached],
-        starts=[start for run in runs for start in run.starts],
-        stretches=[stretches for run in runs for stretches in run.stretches],
-        again=[command for run in runs for command in run.again],
-    )
-
-
-def _stretches(starts: Sequence[Row], config: Config, *, source: str) -> list[Stretch]:
-    """What is left of each start of a run with this `config.yaml`.
-
-    That is nothing if a later one went on from before it, or if all env steps were done already.
-    """
-    found: list[Stretch] = []
-    for start in starts:
-        began = start["env_steps"]
-        used = parse(config.model_dump(mode="json"), start.get("settings"), source=source)
-        found = [*(stretch for stretch in found if stretch[0] < began), (began, used)]
-    return [(began, used) for began, used in found if began < used.trainer.total_env_steps] or [(0, config)]
-
-
-def _again(run_dir: Path, config: Config, stretches: Sequence[Stretch]) -> str:
-    """The command that trains a run with this `config.yaml` again, and one for each later change of its settings."""
-    tables: list[dict[str, Any]] = []
-    for began, used in stretches:
-        table = dotted(used)
-        if tables and not changed(tables[-1], table).keys() - {_TOTAL}:
-            tables.pop()  # longer, but the same
-        elif tables:
-            tables[-1][_TOTAL] = began
-        tables.append(table)
-    copy = f"{run_dir}-again"
-    commands = [["star", "train", str(run_dir / "config.yaml"), "--run-dir", copy]]
-    commands += [["star", "train", "--resume", copy] for _ in tables[1:]]
-    noted = [dotted(config)] + [tables[0]] * (len(tables) - 1)
-    for command, before, table in zip(commands, noted, tables, strict=True):
-        command += [word for key, value in changed(before, table).items() for word in (f"--{key}", _worded(value))]
-    return " && ".join(map(shlex.join, commands))
-
-
-def _checked(lines: JsonLines, kinds: Kinds) -> list[Row]:
-    """The rows, if all have the keys of `kinds` with values of these kinds; lists must be of one length."""
-    rows = lines.read()
-    for number, row in enumerate(rows, 1):
-        for key, kind in kinds.items():
-            if not isinstance(row.get(key), kind):
-                raise ConfigError(
-                    f"{lines.path}: line {number}: {key} is {_worded(row.get(key))[:60]}, which no run writes"
-                )
-        if len({len(row[key]) for key, kind in kinds.items() if kind is list}) > 1:
-            raise ConfigError(f"{lines.path}: line {number}: its lists differ in length")
-    return list(rows)
-
-
-def _complete(rows: Sequence[Row], seeds: int) -> list[list[Row]]:
-    """The rows of each moment that all `seeds` have written; of the last one some may be missing."""
-    return [sorted(of_all, key=lambda row: row["seed"]) for of_all in by_step(rows) if len(of_all) == seeds]
-
-
 def content(runs: Sequence[Run]) -> dict[str, Any]:
     """All that the page shows, as values that JSON can hold."""
     return {
         "made": {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC", "version": metadata.version("star-rl")},
         "runs": [_shown(run, most=MAX_BOXES // len(runs)) for run in runs],
-        "settings": differences([settings(run) for run in runs]),
+        "settings": history.differences([history.settings(run) for run in runs]),
     }
 
 
@@ -254,10 +99,10 @@ def facts(run: Run) -> dict[str, Any]:
         "env_steps_per_s": float(np.median(_table(run.epochs[1:] or run.epochs, "env_steps_per_s")[0])),
         "regions": _short(regions.mean(axis=0))[0],
         "path": ", ".join(map(str, run.paths)),
-        "engine": settings(run)["env.engine"],
+        "engine": history.settings(run)["env.engine"],
         "command": " && ".join(run.again),
         "starts": run.starts,
-        "changes": changes(run),
+        "changes": history.changes(run),
     } | {name: _short(np.ravel(evaluation.mean_band(table))) or None for name, table in best.items()}
 
 
@@ -296,7 +141,7 @@ def _numbers(epochs: Sequence[Sequence[Row]], prefix: str) -> list[str]:
 def _table(epochs: Sequence[Sequence[Row]], key: str) -> np.ndarray:
     """[seeds, epochs] of a metric; NaN where there is no number."""
     found = [[row.get(key) for row in rows] for rows in epochs]
-    values = [[value if isinstance(value, _NUMBER) else math.nan for value in row] for row in found]
+    values = [[value if isinstance(value, NUMBER) else math.nan for value in row] for row in found]
     return np.asarray(values, float).reshape(-1, len(values[0]) if values else 1).T
 
 
@@ -353,46 +198,6 @@ def _frame(row: Row, boxes: dict[tuple[float | None, ...], int]) -> dict[str, An
         if key in row:
             frame[key] = _short(100 * np.asarray(row[key]) / max(sum(row[key]), 1e-9))
     return frame | {key: _short(row[key]) for key in ("value", "competence") if key in row}
-
-
-def changes(run: Run) -> list[dict[str, Any]]:
-    """The settings that were not as before when a run went on or began anew, as {env_steps, key, value}."""
-    found = []
-    for stretches in run.stretches:
-        tables = [dotted(config) for config in (run.config, *(used for _, used in stretches))]
-        for (began, _), (before, after) in zip(stretches, pairwise(tables), strict=True):
-            new = {key: value for key, value in changed(before, after).items() if key not in _OF_SEEDS}
-            found += [{"env_steps": began, "key": key, "value": _worded(value)} for key, value in new.items()]
-    return [row for i, row in enumerate(found) if row not in found[:i]]
-
-
-def settings(run: Run) -> dict[str, str]:
-    """The values of all settings in words, with those that were changed later; of the length only the last."""
-    table = words(run.config)
-    for row in changes(run):
-        key, value = row["key"], row["value"]
-        table[key] = value if key == _TOTAL else f"{table[key]}, {value} from {row['env_steps']:,} env steps"
-    return table
-
-
-def words(config: Config) -> dict[str, str]:
-    """The values of all settings in words, by their dotted keys."""
-    return {key: _worded(value) for key, value in dotted(config).items()}
-
-
-def differences(tables: Sequence[Mapping[str, str]]) -> list[dict[str, Any]]:
-    """The settings in which runs differ, as {key, values}; for a single run those that differ from the defaults.
-
-    The defaults are the last of the `values` then.
-    """
-    tables = [*tables, words(Config())] if len(tables) == 1 else tables
-    keys = {key: None for table in tables for key in table}
-    rows = ({"key": key, "values": [table.get(key, "null") for table in tables]} for key in keys)
-    return [row for row in rows if len(set(row["values"])) > 1]
-
-
-def _worded(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
 
 
 def film(run_dir: Path) -> dict[str, Any]:

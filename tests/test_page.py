@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from star import page, report
+from star import history, page, report
 from star.cli import main
 from star.config import ConfigError
 from star.loading import load, parse
@@ -70,7 +70,7 @@ def make(tmp_path):
 
 
 def read(folder):
-    return page.read(folder, load(folder / "config.yaml"), name=folder.name)
+    return history.read(folder, load(folder / "config.yaml"), name=folder.name)
 
 
 def test_a_curve_is_the_mean_over_seeds_between_the_two_where_there_are_two(make):
@@ -154,14 +154,14 @@ def test_many_moments_are_thinned_evenly_and_keep_the_first_and_the_last(make):
 
 def test_only_settings_that_differ_are_listed():
     one, other = parse({}), parse({"tutor": {"period": 5}, "env": {"options": {"cell": 4.0}}})
-    one, other = page.words(one), page.words(other)
-    differ = page.differences([one, other, one])
+    one, other = history.words(one), history.words(other)
+    differ = history.differences([one, other, one])
     assert {row["key"]: row["values"] for row in differ} == {
         "tutor.period": ["10", "5", "10"],
         "env.options.cell": ["null", "4.0", "null"],
     }
-    assert [row["values"] for row in page.differences([other])] == [["4.0", "null"], ["5", "10"]]
-    assert page.differences([one]) == []
+    assert [row["values"] for row in history.differences([other])] == [["4.0", "null"], ["5", "10"]]
+    assert history.differences([one]) == []
 
 
 def test_runs_of_the_same_name_are_told_apart_by_their_paths(make):
@@ -211,7 +211,7 @@ def test_settings_changed_on_resume_are_told_and_trained_again(make, monkeypatch
 
 def test_settings_changed_on_resume_are_among_those_that_differ(make):
     first, second = read(make("first", resumed=[(400, BOTH)])), read(make("second"))
-    before = page.words(second.config)["commander.practice"]
+    before = history.words(second.config)["commander.practice"]
     assert page.content([first, second])["settings"] == [
         {"key": "commander.practice", "values": [f"{before}, 0.0 from 400 env steps", before]},
         {"key": "trainer.total_env_steps", "values": ["800", "400"]},
@@ -220,12 +220,12 @@ def test_settings_changed_on_resume_are_among_those_that_differ(make):
 
 def test_seeds_that_went_on_with_other_settings_are_not_those_of_one_run(make):
     paths = [alone(make, name, seed, resumed=[(200, LONGER)]) for seed, name in enumerate("ab")]
-    both = page.together("both", [read(path) for path in paths])
-    assert [(row["env_steps"], row["key"]) for row in page.changes(both)] == [(200, "trainer.total_env_steps")]
+    both = history.together("both", [read(path) for path in paths])
+    assert [(row["env_steps"], row["key"]) for row in history.changes(both)] == [(200, "trainer.total_env_steps")]
     assert "trainer.seed" not in page.facts(both)["command"]
     other = read(alone(make, "other", 2, resumed=[(200, BOTH)]))
     with pytest.raises(ConfigError, match="differ in commander.practice; "):
-        page.together("all", [both, other])
+        history.together("all", [both, other])
 
 
 def alone(make, name, *seeds, resumed=(), **settings):
@@ -236,7 +236,7 @@ def alone(make, name, *seeds, resumed=(), **settings):
 def test_seeds_that_were_trained_one_by_one_are_shown_like_seeds_side_by_side(make, tmp_path):
     apart = [read(alone(make, name, *seeds)) for name, seeds in (("b", [2]), ("a", [0, 1]))]
     shown, expected = (
-        page.content([run])["runs"][0] for run in (page.together("all", apart), read(make(seeds=[0, 1, 2])))
+        page.content([run])["runs"][0] for run in (history.together("all", apart), read(make(seeds=[0, 1, 2])))
     )
     for part in ("seeds", "evaluations", "epochs", "map"):
         assert shown[part] == expected[part], part
@@ -245,7 +245,7 @@ def test_seeds_that_were_trained_one_by_one_are_shown_like_seeds_side_by_side(ma
 
 def test_together_runs_are_shown_as_far_as_all_have_come(make):
     first = make("first", seeds=[0], rows=metrics(3, [0]))
-    both = page.together("both", [read(first), read(alone(make, "second", 1))])
+    both = history.together("both", [read(first), read(alone(make, "second", 1))])
     assert [rows[0]["env_steps"] for rows in both.epochs] == [100, 200, 300]
     assert {row["env_steps"] for row in both.regions} == {200}
 
