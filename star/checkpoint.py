@@ -402,18 +402,17 @@ def _memory_given_back() -> Iterator[None]:
     as large as it once was. So blocks of 64 KiB and more are mapped, not taken from a heap. Without it the process
     grows by 2.4 MiB with each of the first 40 checkpoints of 13 MiB, with it by .4, and then by .1.
     """
-    try:
-        libc = ctypes.CDLL("libc.so.6")
-        mallopt, trim = libc.mallopt, libc.malloc_trim
-    except (OSError, AttributeError):  # another C library
-        yield
-        return
-    mallopt(_M_MMAP_THRESHOLD, 64 * 1024)
+    _tell_glibc("mallopt", _M_MMAP_THRESHOLD, 64 * 1024)
     try:
         yield
     finally:
-        mallopt(_M_MMAP_THRESHOLD, 32 * 1024**2)  # the largest there is, which glibc itself comes to in time
-        trim(0)
+        _tell_glibc("mallopt", _M_MMAP_THRESHOLD, 32 * 1024**2)  # the largest, which glibc itself comes to in time
+        _tell_glibc("malloc_trim", 0)
+
+
+def _tell_glibc(function: str, *values: int) -> None:
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        getattr(ctypes.CDLL("libc.so.6"), function)(*values)
 
 
 def _cause(error: Exception) -> str:

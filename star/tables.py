@@ -83,6 +83,8 @@ def groups(found: Sequence[Row]) -> Table:
 def improvements(found: Sequence[Row]) -> Table:
     """How likely a seed of one group is better than one of another; each pair once, in the order of the groups."""
     table = Table(box=box.SIMPLE_HEAD, title="probability that a seed of A is better than one of B")
+    if any(pair["success_any"] is None for pair in found):
+        table.caption = "-: no task in common"
     for name in ("A", "B", "success_any", "success_final"):
         table.add_column(name, justify="left" if len(name) == 1 else "right")
     seen: set[frozenset[str]] = set()

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import assessment, checkpoint, cli, episode, loading, rendering, report
+from star import assessment, checkpoint, cli, episode, loading, rendering, report, tables
 from star import program as programs
 from star.assessment import Exam, Target
 from star.checkpoint import Checkpoints, load_state
@@ -193,6 +193,7 @@ def test_the_folder_of_an_evaluation_holds_its_rows_and_a_figure_for_everything_
     assert comparison["groups"][1]["success_any"]["scores"] == {
         'point_maze {"episode_length": 40}': [seed["success_any"] for seed in rows[2]["seeds"]]
     }
+    assert tables.improvements(comparison["improvement"]).caption == "-: no task in common"
     (tmp_path / "goals-old.png").write_text("of an earlier evaluation")
     written = assessment.write(tmp_path, rows, comparison)
     names = {"evaluation.jsonl", "goals-new.png", "goals-still.png", "curve.png", "profile.png"}
