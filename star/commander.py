@@ -16,7 +16,8 @@ Counts of (i, j) -> i' and mean rewards make a model of the regions, on which va
 
 The probabilities of i' sum to less than 1 where episodes were lost (terminated). What was not tried is believed to
 succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
-region gets there. `prior` decisions weigh as much as this belief.
+region gets there. `prior` decisions weigh as much as this belief. Greedy episodes, in which nothing is learnt, follow
+a plan without it (`settle`).
 
 A share of the environments practises: they pursue random regions instead of the goal, by the same plan with another
 reward, 1 in the region pursued. What is hard to reach, and so unattractive to all others, is tried there.
@@ -39,6 +40,8 @@ from star.config import CommanderConfig
 from star.replay import weighted_mean
 
 Metrics = dict[str, Array]
+
+_HUNCH = 0.1  # what belief is worth where nothing is to be tried
 
 
 class Model(struct.PyTreeNode):
@@ -225,24 +228,66 @@ def plan(
     As long as nothing is known, region j is held reachable from i where `believed` [i, j], and who aims at a goal in
     his own region is taken to succeed (or, with rewards that are negative, to lose nothing anywhere).
     """
-    model, size = state.model, state.chosen.shape[0]
+    model = state.model
     assert model is not None
-    identity = jnp.eye(size)
-    expected = jnp.where(believed[..., None], identity[None], identity[:, None])
+    chances, reward = _expectations(config, model, believed, belief=1.0)
+    pursued = jnp.broadcast_to(jnp.eye(state.chosen.shape[0])[..., None], reward.shape)
+    values, rewards = jnp.stack([state.q, model.reach]), jnp.stack([reward, pursued])
+    q, reach = _iterated(config, allowed, values, rewards, chances, sweeps=config.sweeps)
+    return state.replace(q=q, model=model.replace(reach=reach))
+
+
+def settle(
+    config: CommanderConfig,
+    state: CommanderState,
+    allowed: Successors,
+    *,
+    believed: Bool[Array, "R R"],
+    decisions: int,
+) -> CommanderState:
+    """The Commander for greedy episodes of so many `decisions`, with Q by what commands have led to.
+
+    The belief that what was not tried succeeds makes agents try it, which is of no use where nothing is learnt: here it
+    only decides among what is unknown. And since regions were cut and judged after the last plan, this one begins from
+    nothing. Q stays as it is without a model, and with rewards by distance, of which nothing is the best.
+    """
+    if state.model is None or config.reward != "success":
+        return state
+    chances, reward = _expectations(config, state.model, believed, belief=_HUNCH)
+    q = _iterated(config, allowed, jnp.zeros_like(state.q)[None], reward[None], chances, sweeps=decisions)
+    return state.replace(q=q[0])
+
+
+def _expectations(
+    config: CommanderConfig, model: Model, believed: Bool[Array, "R R"], *, belief: float
+) -> tuple[Float[Array, "R R R"], Float[Array, "R R R"]]:
+    """P(i' | i, j) and r[i, g, j]: what was counted, and `belief` in what was not, the rest of which stays in place."""
+    identity = jnp.eye(believed.shape[0])
+    there, here = identity[None], identity[:, None]
+    expected = jnp.where(believed[..., None], belief * there + (1 - belief) * here, here)
     led = model.led + config.prior * expected
     chances = led / (led.sum(axis=-1) + model.lost)[..., None]
-    arrived = (config.reward == "success") * identity[:, :, None] * identity[:, None]
-    reward = (model.rewards + config.prior * arrived) / (model.visits + config.prior)
+    arrived = (config.reward == "success") * belief * identity[:, :, None] * identity[:, None]
+    return chances, (model.rewards + config.prior * arrived) / (model.visits + config.prior)
 
-    rewards = jnp.stack([reward, jnp.broadcast_to(identity[..., None], reward.shape)])
+
+def _iterated(
+    config: CommanderConfig,
+    allowed: Successors,
+    values: Float[Array, "V R R R"],
+    rewards: Float[Array, "V R R R"],
+    chances: Float[Array, "R R R"],
+    *,
+    sweeps: int,
+) -> Float[Array, "V R R R"]:
+    """The tables `values` after sweeps of value iteration, each with its rewards."""
 
     def sweep(values: Array, _: None) -> tuple[Array, None]:
         future = jax.vmap(partial(_best, allowed=allowed.greedy))(values)
         later = jnp.einsum("ijn,vng->vigj", chances, future, precision=jax.lax.Precision.HIGHEST)
         return rewards + config.discount * later, None
 
-    (q, reach), _ = jax.lax.scan(sweep, jnp.stack([state.q, model.reach]), None, length=config.sweeps)
-    return state.replace(q=q, model=model.replace(reach=reach))
+    return jax.lax.scan(sweep, values, None, length=sweeps)[0]
 
 
 def fade(config: CommanderConfig, state: CommanderState) -> CommanderState:

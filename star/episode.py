@@ -24,7 +24,7 @@ from envs.vector import VectorEnv
 from star import abstraction as regions
 from star import commander, controller, learner, tutor
 from star.abstraction import Abstraction
-from star.commander import Successors
+from star.commander import CommanderState, Successors
 from star.config import AgentConfig
 from star.sgim import strategies
 from star.sgim.strategies import Lesson
@@ -119,6 +119,7 @@ def play(
     reset_key, scan_key = jax.random.split(key)
     streams = start(spec, env, goals=goals, key=reset_key)
     allowed = successors(config, state)
+    state = state.replace(commander=settled(config, state, episode_length=spec.episode_length))
 
     def segment(streams: Streams, key: Array) -> tuple[Streams, Any]:
         command_key, tutor_key, rollout_key = jax.random.split(key, 3)
@@ -171,6 +172,25 @@ def successors(config: AgentConfig, state: TrainState) -> Successors:
         reaches=state.graph.reaches,
         misses=state.graph.misses,
         active=state.abstraction.active,
+    )
+
+
+def believed(config: AgentConfig, state: TrainState) -> Bool[Array, "R R"]:
+    """Pairs whose targets count as reachable as long as nobody has tried."""
+    neighbours = regions.adjacent(state.abstraction) & (state.graph.told >= 0)
+    if config.commander.successors == "all":
+        return neighbours
+    return state.graph.reaches | (neighbours & ~state.graph.misses)
+
+
+def settled(config: AgentConfig, state: TrainState, *, episode_length: int) -> CommanderState:
+    """The Commander as it acts in greedy episodes of so many env steps."""
+    return commander.settle(
+        config.commander,
+        state.commander,
+        successors(config, state),
+        believed=believed(config, state),
+        decisions=episode_length // config.commander.period,
     )
 
 

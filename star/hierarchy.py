@@ -261,10 +261,7 @@ def _command_better(
         return learnt
 
     def plan(learnt: CommanderState) -> CommanderState:
-        believed = regions.adjacent(state.abstraction) & (state.graph.told >= 0)
-        if config.commander.successors != "all":
-            believed = state.graph.reaches | (believed & ~state.graph.misses)
-        return commander.plan(config.commander, learnt, allowed, believed=believed)
+        return commander.plan(config.commander, learnt, allowed, believed=episode.believed(config, state))
 
     period = config.commander.period // config.tutor.period
     return jax.lax.cond(number % period == period - 1, plan, lambda same: same, learnt)

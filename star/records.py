@@ -52,7 +52,12 @@ class Records:
         if not program.config.commander.enabled:
             return []
         return report.region_rows(
-            program.config.agent(), state, seeds=program.seeds, env_steps=env_steps, goal=program.goal
+            program.config.agent(),
+            state,
+            seeds=program.seeds,
+            env_steps=env_steps,
+            goal=program.goal,
+            episode_length=program.spec.episode_length,
         )
 
     def _notice(self, table: Sequence[Mapping[str, Any]]) -> None:

@@ -30,17 +30,24 @@ Row = Mapping[str, Any]
 
 
 def region_rows(
-    config: AgentConfig, state: TrainState, *, seeds: Sequence[int], env_steps: int, goal: np.ndarray
+    config: AgentConfig,
+    state: TrainState,
+    *,
+    seeds: Sequence[int],
+    env_steps: int,
+    goal: np.ndarray,
+    episode_length: int,
 ) -> list[dict[str, Any]]:
     """The abstraction of every seed (leading axis of `state`) as plain values, a row of `regions.jsonl` each.
 
     `lower` and `upper` are the corners of the regions in use, `chosen` how often the Commander chose each of late,
     `visited` how many of its decisions of late began there (of a learned model only). `value` is the Commander's value
-    of each for `goal` [d], a test goal, `target` the index of the region it would choose there. `reaches` and `misses`
-    are pairs of indices: the edges of the graph, and what was shown unreachable. With SGIM there are its `competence`
-    in each region, and `drawn`, the share of its choices that fall there.
+    of each for `goal` [d], a test goal, `target` the index of the region it would choose there, both as in greedy
+    episodes of `episode_length` env steps. `reaches` and `misses` are pairs of indices: the edges of the graph, and
+    what was shown unreachable. With SGIM there are its `competence` in each region, and `drawn`, the share of its
+    choices that fall there.
     """
-    tables = _tables(config, jax.numpy.asarray(goal), state)
+    tables = _tables(config, jax.numpy.asarray(goal), state, episode_length)
     verdicts = {"reaches": state.graph.reaches, "misses": state.graph.misses}
     found, pairs, count = jax.device_get((tables, verdicts, state.abstraction.count))
 
@@ -56,15 +63,16 @@ def region_rows(
     ]
 
 
-@jax.jit
-def _tables(config: AgentConfig, goal: Array, states: TrainState) -> dict[str, Array]:
+@partial(jax.jit, static_argnames="episode_length")
+def _tables(config: AgentConfig, goal: Array, states: TrainState, episode_length: int) -> dict[str, Array]:
     """What is known of each region of every seed, leading axes [seeds, R]."""
-    return jax.vmap(partial(_table, config, goal))(states)
+    return jax.vmap(partial(_table, config, goal, episode_length))(states)
 
 
-def _table(config: AgentConfig, goal: Array, state: TrainState) -> dict[str, Array]:
+def _table(config: AgentConfig, goal: Array, episode_length: int, state: TrainState) -> dict[str, Array]:
     goal_region = locate(state.abstraction, goal)
-    value, target = commander.towards(state.commander, episode.successors(config, state), goal_region)
+    settled = episode.settled(config, state, episode_length=episode_length)
+    value, target = commander.towards(settled, episode.successors(config, state), goal_region)
     tables = {
         "lower": state.abstraction.lower,
         "upper": state.abstraction.upper,

@@ -1,5 +1,7 @@
 """Q-learning and planning over regions, against loops over decisions and cells."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -93,7 +95,7 @@ def test_periods_with_weight_0_teach_nothing(observe, learner):
     assert all(jax.tree.leaves(jax.tree.map(lambda a, b: (a == b).all(), after, state)))
 
 
-def slow_plan(batch, allowed, believed, *, discount, prior, sweeps):
+def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
     """Value iteration from 0 over a model counted decision by decision: for the goals, and to be in their region."""
     q, reach = np.zeros((2, R, R, R))
     led, reward, visits = np.zeros((R, R, R + 1)), np.zeros((R, R, R)), np.zeros((R, R, R))
@@ -115,9 +117,10 @@ def slow_plan(batch, allowed, believed, *, discount, prior, sweeps):
         for i in range(R):
             for j in range(R):
                 counts = led[i, j].copy()
-                counts[j if believed[i, j] else i] += prior
+                counts[j] += prior * belief * believed[i, j]
+                counts[i] += prior * (1 - belief * believed[i, j])
                 for g in range(R):
-                    r = reward[i, g, j] + prior * (i == g == j)
+                    r = reward[i, g, j] + prior * belief * (i == g == j)
                     q[i, g, j] = r / (visits[i, g, j] + prior) + discount * counts @ value[:, g] / counts.sum()
                     reach[i, g, j] = (i == g) + discount * counts @ chance[:, g] / counts.sum()
     return q, reach
@@ -135,16 +138,25 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     q, reach = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
     np.testing.assert_allclose(planned.q, q, rtol=1e-5)
     np.testing.assert_allclose(planned.model.reach, reach, rtol=1e-5)
+    settle = partial(jax.jit(commander.settle, static_argnames="decisions"), chosen, believed=jnp.array(believed))
+    q, _ = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=4, belief=0.1)
+    for before in (state, planned):  # whatever was planned before
+        settled = settle(before, allowed, decisions=4)
+        np.testing.assert_allclose(settled.q, q, rtol=1e-5, atol=1e-12)
+        assert settled.model is before.model or (settled.model.reach == before.model.reach).all()
 
 
-def corridor(batch_of, sweeps=60):
-    """Plans in regions 0-1-2-3 in a row, of which each believes to reach its neighbours."""
-    chosen = settings(learner="model", reward="success", discount=0.9, prior=1.0, sweeps=sweeps)
+def corridor(batch_of, *, shortcut=False, greedy=False):
+    """Plans in regions 0-1-2-3 in a row, of which each believes to reach its neighbours, and 3 by the `shortcut`."""
+    chosen = settings(learner="model", reward="success", discount=0.9, prior=1.0, sweeps=60)
     neighbours = np.abs(np.subtract.outer(np.arange(R), np.arange(R))) == 1
+    neighbours[0, 3] = shortcut
     everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
     state = commander.init(chosen, regions=R)
     for batch in batch_of:
         state = commander.observe(chosen, state, everything, batch)
+    if greedy:
+        return commander.settle(chosen, state, everything, believed=jnp.array(neighbours), decisions=10).q
     return commander.plan(chosen, state, everything, believed=jnp.array(neighbours)).q
 
 
@@ -168,6 +180,23 @@ def test_what_was_not_tried_is_believed_and_what_failed_is_not():
     q = corridor([many(1, 2, 1)])  # a wall between 1 and 2
     assert q[0, 3].max() < 0.3 * corridor([])[0, 3].max()
     assert corridor([many(1, 2, 1), many(1, 4, 3)])[1, 3].argmax() == 4  # aiming at 4 leads to 3
+
+
+def test_greedy_episodes_go_where_others_went_and_by_belief_only_where_nobody_was():
+    tried = [many(0, 1, 1), many(1, 2, 2), many(2, 3, 3)]
+    assert corridor(tried, shortcut=True)[0, 3].argmax() == 3
+    assert corridor(tried, shortcut=True, greedy=True)[0, 3].argmax() == 1
+    assert corridor([], shortcut=True, greedy=True)[0, 3].argmax() == 3
+    assert corridor([many(0, 3, 0, count=1000)], shortcut=True, greedy=True)[0, 3].argmax() == 1
+
+
+@pytest.mark.parametrize("changed", [{"learner": "q"}, {"reward": "max"}])
+def test_values_stay_as_they_are_where_nothing_is_counted_or_nothing_is_best(changed):
+    chosen = settings(**{"learner": "model", "reward": "success"} | changed)
+    state, allowed = random_state(0)
+    state = commander.init(chosen, regions=R).replace(q=state.q)
+    settled = commander.settle(chosen, state, allowed, believed=jnp.ones((R, R), bool), decisions=3)
+    np.testing.assert_array_equal(settled.q, state.q)
 
 
 def test_a_command_that_ends_the_episode_is_worth_less_than_one_that_fails():

@@ -349,14 +349,16 @@ def test_a_map_is_kept_whatever_becomes_of_its_file(section, tmp_path):
     assert getattr(programs.build(parse(RUN, settings)).config.env, section)["map"] == rows
 
 
-def test_training_episodes_of_another_length_leave_evaluation_as_it_is():
+def test_neither_the_length_of_training_episodes_nor_what_was_planned_before_changes_evaluation():
     shorter = {"env.training.episode_length": 20, "tutor.unroll": 1}
     one, other = (programs.build(parse(RUN, {"tutor.unroll": 1} | more)) for more in ({}, shorter))
     assert (one.spec.episode_length, other.spec.episode_length) == (60, 20)
-    found = [
-        program.evaluate(program.init(program.seed_keys()), program.evaluation_keys(0)) for program in (one, other)
-    ]
-    jax.tree.map(np.testing.assert_array_equal, *found)
+    fresh, shorter_fresh = (program.init(program.seed_keys()) for program in (one, other))
+    planned = jax.random.uniform(jax.random.key(0), fresh.commander.q.shape)
+    before = fresh.replace(commander=fresh.commander.replace(q=planned))
+    found = one.evaluate(fresh, one.evaluation_keys(0))
+    for program, state in ((other, shorter_fresh), (one, before)):
+        jax.tree.map(np.testing.assert_array_equal, found, program.evaluate(state, one.evaluation_keys(0)))
     with pytest.raises(ConfigError, match="tutor.period: 10 does not divide the test episode of 55"):
         programs.build(parse(RUN, shorter | {"env.options.episode_length": 55}))
 
