@@ -193,7 +193,9 @@ def test_the_folder_of_an_evaluation_holds_its_rows_and_a_figure_for_everything_
     assert comparison["groups"][1]["success_any"]["scores"] == {
         'point_maze {"episode_length": 40}': [seed["success_any"] for seed in rows[2]["seeds"]]
     }
-    assert tables.improvements(comparison["improvement"]).caption == "-: no task in common"
+    elsewhere = assessment.compare([*rows[:-1], rows[-1] | {"env": "ant_maze"}], groups)
+    captions = [tables.improvements(found["improvement"]).caption for found in (comparison, elsewhere)]
+    assert captions == [None, "-: no task in common"]
     (tmp_path / "goals-old.png").write_text("of an earlier evaluation")
     written = assessment.write(tmp_path, rows, comparison)
     names = {"evaluation.jsonl", "goals-new.png", "goals-still.png", "curve.png", "profile.png"}
