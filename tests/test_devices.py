@@ -69,7 +69,6 @@ import sys
 from pathlib import Path
 import jax, jax.numpy as jnp, mujoco, numpy as np
 from envs import VectorEnv, make
-from envs.batching import shared_out
 from envs.physics import Physics
 from star import devices
 from star.checkpoint import Checkpoints
@@ -90,8 +89,7 @@ def fall(height):
 def walk(key):
     state = devices.share(batch.reset(key))
     state = batch.step(state, jnp.ones((4, 2)))
-    fallen = jax.vmap(shared_out(jax.vmap(fall)))(devices.share(jnp.ones((1, 4, 1)), axis=1))
-    return {"far": devices.whole(state.obs), "fallen": devices.whole(fallen)}
+    return {"far": devices.whole(state.obs), "fallen": jax.vmap(fall)(jnp.ones((4, 1)))}
 
 state = jax.jit(devices.on(mesh, walk), out_shardings=devices.everywhere(mesh))(jax.random.key(3))
 Journal.of(folder, muted=not devices.first()).metrics.write({"process": number})
@@ -141,7 +139,7 @@ def test_two_processes_step_one_batch_and_the_first_alone_writes(tmp_path):
     for number in range(2):
         np.testing.assert_allclose(np.load(tmp_path / f"{number}.npy"), alone, rtol=1e-6)
     checkpoints = Checkpoints(tmp_path)
-    assert checkpoints.arrays(1)["fallen"].shape == (1, 4, 1)
+    assert checkpoints.arrays(1)["fallen"].shape == (4, 1)
     np.testing.assert_allclose(checkpoints.arrays(1)["far"], alone, rtol=1e-6)
     checkpoints.close()
 
