@@ -156,7 +156,7 @@ class Checkpoints:
 
         `example` (arrays or their shapes) gives the structure it must have, and the devices: else the first one here.
         """
-        here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        here = devices.everywhere(None)
         shapes = jax.eval_shape(plain, example)
         template = jax.tree.map(
             lambda x, like: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=getattr(like, "sharding", None) or here),
@@ -178,7 +178,7 @@ class Checkpoints:
     def arrays(self, step: int) -> Arrays:
         """All that is saved at `step` by its name, such as `tutor/params/...`, as its format has it."""
         path = self._path / str(step)
-        here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+        here = devices.everywhere(None)
         saved = self._open().metadata(path.absolute() / "state").item_metadata.tree
         template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), saved)
         leaves, _ = jax.tree_util.tree_flatten_with_path(self._read(path, template))

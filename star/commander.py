@@ -17,7 +17,7 @@ Counts of (i, j) -> i' and mean rewards make a model of the regions, on which va
 The probabilities of i' sum to less than 1 where episodes were lost (terminated). What was not tried is believed to
 succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
 region gets there. `prior` decisions weigh as much as this belief. Greedy episodes, in which nothing is learnt, follow
-a plan without it (`settle`).
+a plan with hardly any of it (`settle`).
 
 A share of the environments practises: they pursue random regions instead of the goal, by the same plan with another
 reward, 1 in the region pursued. What is hard to reach, and so unattractive to all others, is tried there.
