@@ -137,6 +137,10 @@ class Ant:
         """Whether the torso's own up axis points down."""
         return 1.0 - 2.0 * (data.qpos[4] ** 2 + data.qpos[5] ** 2) < ON_ITS_BACK
 
+    def fallen(self, data: PhysicsState) -> jax.Array:
+        """Whether the torso is below half the height of the floor."""
+        return data.qpos[2] < self._arena.floor_height / 2
+
     def dropped(self, data: PhysicsState) -> jax.Array:
         """Whether MJX-Warp ran out of room for contacts."""
         return data.overflow > 0

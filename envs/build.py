@@ -48,5 +48,6 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
         reward=chosen["reward"],
         success_radius=task.success_radius if radius is None else radius,
         flip=chosen.get("flip", "ignore"),
+        fall=chosen.get("fall", "ignore"),
         position_noise=chosen["position_noise"],
     )

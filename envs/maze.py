@@ -5,7 +5,8 @@
     success = distance < success_radius, at this step
 
 An episode is truncated after `episode_length` steps, and at once if the simulator fails: a state that is not finite,
-contacts that were dropped. The observation then stays what it was. With `flip` it also ends when the body turns over.
+contacts that were dropped. The observation then stays what it was. With `flip` it also ends when the body turns over,
+with `fall` when it lies in a gap.
 An episode that has ended before its time stays as it is until the next reset.
 """
 
@@ -52,6 +53,9 @@ class Body(Protocol):
     def flipped(self, data: Any) -> jax.Array:
         """Whether the body lies on its back (bool)."""
 
+    def fallen(self, data: Any) -> jax.Array:
+        """Whether the body is down in a gap of the floor (bool)."""
+
     def dropped(self, data: Any) -> jax.Array:
         """Whether the engine dropped contacts in the last step (bool)."""
 
@@ -93,6 +97,7 @@ class MazeEnv(Env):
         reward: str,
         success_radius: float,
         flip: str = "ignore",
+        fall: str = "ignore",
         position_noise: float = 0.0,
     ):
         """`task` is a row of the registry; the other arguments are options of docs/environments.md."""
@@ -114,7 +119,7 @@ class MazeEnv(Env):
         self._goals = task.goals[goals]
         self._starts = task.starts[start]
         self._sparse = reward == "sparse"
-        self._flip = flip
+        self._ends = {"flipped": flip, "fallen": fall}
         self._position_noise = position_noise
 
     @property
@@ -170,7 +175,7 @@ class MazeEnv(Env):
             obs=obs,
             reward=zero,
             done=zero,
-            metrics=self._metrics(obs) | {"non_finite": zero, "overflow": zero, "flipped": zero},
+            metrics=self._metrics(obs) | {"non_finite": zero, "overflow": zero} | dict.fromkeys(self._ends, zero),
             info={"steps": steps, "truncation": zero, "goal": goal},
         )
 
@@ -192,16 +197,17 @@ class MazeEnv(Env):
         seen = self._body.observe(data, steps)
         non_finite = ~(_all_finite(data) & jnp.isfinite(seen).all())
         overflow = ~non_finite & self._body.dropped(data)
-        flipped = ~non_finite & self._body.flipped(data)
+        mishaps = {"flipped": self._body.flipped(data), "fallen": self._body.fallen(data)}
+        mishaps = {name: ~non_finite & happened for name, happened in mishaps.items()}
         going, failed = before.ended == 0, non_finite | overflow
-        terminated = (before.terminated > 0) | (going & ~failed & flipped & (self._flip == "terminate"))
-        ended = ~going | failed | terminated | (flipped & (self._flip == "truncate"))
+        terminated = (before.terminated > 0) | (going & ~failed & self._ended_by(mishaps, "terminate"))
+        ended = ~going | failed | terminated | self._ended_by(mishaps, "truncate")
         done = ended | (steps >= self.episode_length)
         obs = jnp.where(going & ~failed, jnp.concatenate([seen, state.info["goal"]]), state.obs)
         metrics = self._metrics(obs) | {
             "non_finite": (going & non_finite).astype(jnp.float32),
             "overflow": (going & overflow).astype(jnp.float32),
-            "flipped": flipped.astype(jnp.float32),
+            **{name: happened.astype(jnp.float32) for name, happened in mishaps.items()},
         }
         info = {
             "steps": steps.astype(state.info["steps"].dtype),
@@ -216,6 +222,11 @@ class MazeEnv(Env):
             metrics={**state.metrics, **metrics},
             info={**state.info, **info},
         )
+
+    def _ended_by(self, mishaps: dict[str, jax.Array], how: str) -> jax.Array:
+        """Whether one of `mishaps` is to end the episode by `how`."""
+        chosen = [happened for name, happened in mishaps.items() if self._ends[name] == how]
+        return jnp.any(jnp.stack(chosen), axis=0) if chosen else jnp.zeros((), bool)
 
     def _shaken(self, data: Any, noise: jax.Array) -> tuple[Any, jax.Array]:
         """`data` with noise on the body's position, and the next key."""

@@ -95,6 +95,10 @@ class Point:
         """Never."""
         return jnp.zeros((), bool)
 
+    def fallen(self, data: PointState) -> jax.Array:
+        """Never."""
+        return jnp.zeros((), bool)
+
     def dropped(self, data: PointState) -> jax.Array:
         """Never."""
         return jnp.zeros((), bool)

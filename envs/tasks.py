@@ -166,6 +166,7 @@ COMMON: Mapping[str, Option] = {
 
 ANT: Mapping[str, Option] = {
     "flip": choice("ignore", "terminate", "truncate"),
+    "fall": choice("ignore", "terminate", "truncate"),
     "preset": choice(*PRESETS),
     "collisions": choice("all", "feet"),
     "timestep": duration(0.02, 1.0),

@@ -86,6 +86,9 @@ class Fused:
     def flipped(self, data):
         return data[1] == 0
 
+    def fallen(self, data):
+        return jnp.zeros((), bool)
+
     def dropped(self, data):
         return jnp.zeros((), bool)
 

@@ -174,22 +174,30 @@ def test_only_torso_and_shins_collide_with_feet():
     assert names == {"torso", "shin_1", "shin_2", "shin_3", "shin_4"}
 
 
-@pytest.mark.parametrize("flip", ["ignore", "terminate", "truncate"])
-def test_a_flipped_ant_ends_the_episode_only_if_asked_and_stays_ended(flip):
-    env = envs.make("ant_maze", engine="native", flip=flip)
+ON_ITS_BACK = {3: 0.0, 4: 1.0, 5: 0.0, 6: 0.0}  # entries of qpos
+IN_THE_GAP = {1: 16.0, 2: 0.75}
+
+
+@pytest.mark.parametrize("how", ["ignore", "terminate", "truncate"])
+@pytest.mark.parametrize(
+    ("option", "name", "place"), [("flip", "flipped", ON_ITS_BACK), ("fall", "fallen", IN_THE_GAP)]
+)
+def test_a_flipped_or_fallen_ant_ends_the_episode_only_if_asked_and_stays_ended(option, name, place, how):
+    env = envs.make("ant_fall", engine="native", **{option: how})
     state = env.reset(jax.random.key(0))
-    over = jnp.array([0.0, 1.0, 0.0, 0.0])  # on its back
     data = state.pipeline_state.data
-    upside_down = data.replace(qpos=data.qpos.at[3:7].set(over), qvel=jnp.zeros_like(data.qvel))
+    lost = data.replace(qpos=data.qpos.at[jnp.array([*place])].set(jnp.array([*place.values()])), qvel=0 * data.qvel)
     step = jax.jit(env.step)
-    after = step(state.replace(pipeline_state=state.pipeline_state.replace(data=upside_down)), jnp.zeros(8))
-    flags = {"ignore": (0.0, 0.0), "terminate": (1.0, 0.0), "truncate": (1.0, 1.0)}[flip]
+    fine, after = (
+        step(state.replace(pipeline_state=state.pipeline_state.replace(data=x)), jnp.zeros(8)) for x in (data, lost)
+    )
+    flags = {"ignore": (0.0, 0.0), "terminate": (1.0, 0.0), "truncate": (1.0, 1.0)}[how]
     assert (float(after.done), float(after.info["truncation"])) == flags
-    assert float(after.metrics["flipped"]) == 1.0
+    assert [float(x.metrics[name]) for x in (fine, after)] == [0.0, 1.0]
     upright = after.replace(pipeline_state=after.pipeline_state.replace(data=data))
     again = step(upright, jnp.zeros(8))
     assert (float(again.done), float(again.info["truncation"])) == flags
-    assert bool((again.obs == after.obs).all()) == (flip != "ignore")
+    assert bool((again.obs == after.obs).all()) == (how != "ignore")
 
 
 def test_dropped_contacts_end_the_episode_and_are_counted_once():
