@@ -9,11 +9,14 @@ After k steps it learns in one of two ways. Q-learning (`q`, published), with r 
 The B environments are B streams of one table: the errors of a cell are averaged over the n decisions of a batch that
 visited it, and alpha_n = 1 - (1 - alpha)^n is the step that n updates in a row towards that average would make.
 
-Planning (`model`): where a command leads does not depend on the goal, so every decision teaches about all goals.
-Counts of (i, j) -> i' and mean rewards make a model of the regions, on which value iteration runs at every instant:
+Planning (`model`): where the command of a region leads does not depend on the goal, so every decision teaches about all
+goals. Counts of (i, j) -> i' and mean rewards make a model of the regions, on which value iteration runs at every
+instant:
 
     Q[i, g, j] <- r[i, g, j] + gamma sum_i' P(i' | i, j) max_j' Q[i', g, j']
 
+Commanding the goal's own region is another thing, for the Tutor is then given the goal: P(i' | i, g) is counted apart,
+and believed to be as where the goal is elsewhere.
 The probabilities of i' sum to less than 1 where episodes were lost (terminated). What was not tried is believed to
 succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
 region gets there. `prior` decisions weigh as much as this belief. Greedy episodes, in which nothing is learnt, follow
@@ -47,14 +50,14 @@ _HUNCH = 0.1  # what belief is worth where nothing is to be tried
 class Model(struct.PyTreeNode):
     """Fading counts of where commands led, and of the rewards on the way."""
 
-    led: Float[Array, "R R R"]
-    """Decisions by region, target and next region."""
+    led: Float[Array, "2 R R R"]
+    """Decisions by aim (0: the target region, 1: the goal in it), region, target and next region."""
     rewards: Float[Array, "R R R"]
     """Sums of rewards by region, goal region and target."""
     visits: Float[Array, "R R R"]
     """Decisions by region, goal region and target."""
-    lost: Float[Array, "R R"]
-    """Decisions by region and target during which the episode was terminated."""
+    lost: Float[Array, "2 R R"]
+    """Decisions by aim, region and target during which the episode was terminated."""
     reach: Float[Array, "R R R"]
     """Values like Q for those who practise: discounted chances of being in the pursued region."""
 
@@ -103,7 +106,8 @@ def init(config: CommanderConfig, *, regions: int) -> CommanderState:
     cube = jnp.zeros((regions, regions, regions))
     model = None
     if config.learner == "model":
-        model = Model(led=cube, rewards=cube, visits=cube, lost=cube[0], reach=cube)
+        both = jnp.stack([cube, cube])
+        model = Model(led=both, rewards=cube, visits=cube, lost=both[:, 0], reach=cube)
     return CommanderState(q=cube, chosen=jnp.zeros(regions), model=model)
 
 
@@ -206,12 +210,14 @@ def observe(
     direct = 1 - batch.aside
     weight = batch.weight * direct
     # Who practises and aims at the goal's region aims at its centre, which tells nothing of aiming at the goal.
-    telling = weight * (1 - batch.practised * (batch.target == batch.goal_region))
+    at_goal = batch.target == batch.goal_region
+    telling = weight * (1 - batch.practised * at_goal)
+    aim = (at_goal & (batch.practised == 0)).astype(jnp.int32)
     model = state.model.replace(
-        led=state.model.led.at[batch.region, batch.target, batch.next_region].add(weight),
+        led=state.model.led.at[aim, batch.region, batch.target, batch.next_region].add(weight),
         rewards=state.model.rewards.at[cell].add(telling * batch.reward),
         visits=state.model.visits.at[cell].add(telling),
-        lost=state.model.lost.at[batch.region, batch.target].add(batch.lost * direct),
+        lost=state.model.lost.at[aim, batch.region, batch.target].add(batch.lost * direct),
     )
     return state.replace(model=model)
 
@@ -260,13 +266,15 @@ def settle(
 
 def _expectations(
     config: CommanderConfig, model: Model, believed: Bool[Array, "R R"], *, belief: float
-) -> tuple[Float[Array, "R R R"], Float[Array, "R R R"]]:
-    """P(i' | i, j) and r[i, g, j]: what was counted, and `belief` in what was not, the rest of which stays in place."""
+) -> tuple[Float[Array, "2 R R R"], Float[Array, "R R R"]]:
+    """P(i' | i, j) by aim, and r[i, g, j]: what was counted, and `belief` in what was not, else staying in place."""
     identity = jnp.eye(believed.shape[0])
     there, here = identity[None], identity[:, None]
     expected = jnp.where(believed[..., None], belief * there + (1 - belief) * here, here)
-    led = model.led + config.prior * expected
-    chances = led / (led.sum(axis=-1) + model.lost)[..., None]
+    counted = (model.led.sum(axis=-1) + model.lost + config.prior)[..., None]
+    to_region = (model.led[0] + config.prior * expected) / counted[0]
+    to_goal = (model.led[1] + config.prior * to_region) / counted[1]
+    chances = jnp.stack([to_region, to_goal])
     arrived = (config.reward == "success") * belief * identity[:, :, None] * identity[:, None]
     return chances, (model.rewards + config.prior * arrived) / (model.visits + config.prior)
 
@@ -276,15 +284,20 @@ def _iterated(
     allowed: Successors,
     values: Float[Array, "V R R R"],
     rewards: Float[Array, "V R R R"],
-    chances: Float[Array, "R R R"],
+    chances: Float[Array, "2 R R R"],
     *,
     sweeps: int,
 ) -> Float[Array, "V R R R"]:
-    """The tables `values` after sweeps of value iteration, each with its rewards."""
+    """The tables `values` after sweeps of value iteration, each with its rewards; the first is that of goals."""
+    to_region, to_goal = chances
+    product = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+    own = jnp.eye(values.shape[1], dtype=bool)
 
     def sweep(values: Array, _: None) -> tuple[Array, None]:
         future = jax.vmap(partial(_best, allowed=allowed.greedy))(values)
-        later = jnp.einsum("ijn,vng->vigj", chances, future, precision=jax.lax.Precision.HIGHEST)
+        later = product("ijn,vng->vigj", to_region, future)
+        at_goal = product("ign,ng->ig", to_goal, future[0])
+        later = later.at[0].set(jnp.where(own, at_goal[..., None], later[0]))
         return rewards + config.discount * later, None
 
     return jax.lax.scan(sweep, values, None, length=sweeps)[0]
@@ -382,15 +395,19 @@ def accumulate(
 
 
 def on_split(state: CommanderState, *, parent: Int[Array, ""], child: Int[Array, ""]) -> CommanderState:
-    """The new region inherits rows and columns of the one it was cut from; they share what arrived there."""
+    """The new region inherits rows and columns of the one it was cut from; they share what arrived there.
+
+    What aiming at the goal in the old region paid tells nothing of aiming at the half in which the goal is not.
+    """
     cells = lambda table, axes: inherit(table, parent=parent, child=child, axes=axes)  # noqa: E731
+    beside = jnp.stack([parent, child]), jnp.stack([child, parent])
     model = state.model
     if model is not None:
         model = Model(
-            led=cells(model.led.at[:, :, parent].multiply(0.5), (0, 1, 2)),
-            rewards=cells(model.rewards, (0, 1, 2)),
-            visits=cells(model.visits, (0, 1, 2)),
-            lost=cells(model.lost, (0, 1)),
+            led=cells(model.led.at[..., parent].multiply(0.5), (1, 2, 3)),
+            rewards=cells(model.rewards, (0, 1, 2)).at[:, *beside].set(0.0),
+            visits=cells(model.visits, (0, 1, 2)).at[:, *beside].set(0.0),
+            lost=cells(model.lost, (1, 2)),
             reach=cells(model.reach, (0, 1, 2)),
         )
     return CommanderState(

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 3  # since checksums
+FORMAT = 4  # since aiming at a goal is counted apart from aiming at its region
 
 About = dict[str, Any]
 """What a checkpoint says of itself: `format`, `config` (nested, as in `config.yaml`), `success_final` and the rest."""
@@ -27,8 +27,15 @@ class Migration:
     arrays: Callable[[Arrays], Arrays] = lambda arrays: arrays
 
 
+def _count_for_both_aims(arrays: Arrays) -> Arrays:
+    """The Commander's counts [seeds, ...] for either aim [seeds, 2, ...]: nobody knows any more which it was."""
+    counts = ("commander/model/led", "commander/model/lost")
+    return {name: np.stack([x, x], axis=1) if name in counts else x for name, x in arrays.items()}
+
+
 TO_NEXT: Mapping[int, Migration] = {
     2: Migration(),  # the same, in other files and without checksums
+    3: Migration(arrays=_count_for_both_aims),
 }
 
 

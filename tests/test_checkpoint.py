@@ -16,7 +16,7 @@ import pytest
 from star import checkpoint, migrations
 from star.checkpoint import Checkpoints, Damaged, best, choose, kept, newest
 from star.config import Config, ConfigError
-from star.migrations import FORMAT, Migration
+from star.migrations import FORMAT, Migration, migrated_arrays
 from tests.small import unpacked
 
 ROOT = Path(__file__).parents[1]
@@ -274,13 +274,23 @@ def test_an_older_format_is_brought_up_step_by_step(checkpoints, monkeypatch):
         assert told in str(error.value)
 
 
-def test_what_is_read_of_format_2_is_what_was_written(tmp_path):
-    run_dir = unpacked("format_2", tmp_path)
+@pytest.mark.parametrize("name", ["format_2", "format_3"])
+def test_what_is_read_of_an_older_format_is_what_was_written(name, tmp_path):
+    run_dir = unpacked(name, tmp_path)
     checkpoints = Checkpoints(run_dir)
     assert checkpoints.steps() == [480] and checkpoints.best() == 480
     assert checkpoints.config(480).trainer.num_seeds == 2
     arrays = checkpoints.arrays(480)
     assert arrays["epoch"].tolist() == [2, 2] and arrays["tutor/params/actor/params/Dense_0/kernel"].shape == (2, 8, 8)
+    before, after = (x["commander/model/led"] for x in (arrays, migrated_arrays(arrays, int(name[-1]))))
+    assert before.any() and (after == before[:, None]).all()  # of seeds, then of aims, which were counted together
+    assert after.shape == (2, 2, *before.shape[1:])
+    checkpoints.close()
+
+
+def test_a_checkpoint_of_format_2_whose_config_is_damaged_is_refused(tmp_path):
+    run_dir = unpacked("format_2", tmp_path)
+    checkpoints = Checkpoints(run_dir)
     (run_dir / "checkpoints" / "480" / "config" / "metadata").write_text("{")
     with pytest.raises(Damaged, match="its config cannot be read"):
         checkpoints.config(480)

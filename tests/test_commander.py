@@ -98,11 +98,13 @@ def test_periods_with_weight_0_teach_nothing(observe, learner):
 def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
     """Value iteration from 0 over a model counted decision by decision: for the goals, and to be in their region."""
     q, reach = np.zeros((2, R, R, R))
-    led, reward, visits = np.zeros((R, R, R + 1)), np.zeros((R, R, R)), np.zeros((R, R, R))
+    reward, visits = np.zeros((2, R, R, R))
+    to_region, to_goal = np.zeros((2, R, R, R + 1))
     for n in range(N):
         i, g, j = batch.region[n], batch.goal_region[n], batch.target[n]
         if batch.aside[n]:
             continue
+        led = to_goal if j == g and not batch.practised[n] else to_region
         led[i, j, batch.next_region[n]] += batch.weight[n]
         led[i, j, R] += batch.lost[n]  # a state that is worth nothing
         if not (batch.practised[n] and j == g):
@@ -116,13 +118,17 @@ def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
                 chance[i, g] = max(reach[i, g, j] for j in range(R) if allowed[i, j])
         for i in range(R):
             for j in range(R):
-                counts = led[i, j].copy()
-                counts[j] += prior * belief * believed[i, j]
-                counts[i] += prior * (1 - belief * believed[i, j])
+                chances = to_region[i, j].copy()
+                chances[j] += prior * belief * believed[i, j]
+                chances[i] += prior * (1 - belief * believed[i, j])
+                chances /= chances.sum()
+                at_goal = to_goal[i, j] + prior * chances
+                at_goal /= at_goal.sum()
                 for g in range(R):
                     r = reward[i, g, j] + prior * belief * (i == g == j)
-                    q[i, g, j] = r / (visits[i, g, j] + prior) + discount * counts @ value[:, g] / counts.sum()
-                    reach[i, g, j] = (i == g) + discount * counts @ chance[:, g] / counts.sum()
+                    later = (at_goal if j == g else chances) @ value[:, g]
+                    q[i, g, j] = r / (visits[i, g, j] + prior) + discount * later
+                    reach[i, g, j] = (i == g) + discount * chances @ chance[:, g]
     return q, reach
 
 
@@ -160,13 +166,13 @@ def corridor(batch_of, *, shortcut=False, greedy=False):
     return commander.plan(chosen, state, everything, believed=jnp.array(neighbours)).q
 
 
-def many(region, target, next_region, *, count=100, lost=0.0):
+def many(region, target, next_region, *, goal=4, count=100, lost=0.0, reward=0.0):
     ones = np.ones(count, np.int32)
     return Decision(
         region=region * ones,
-        goal_region=4 * ones,
+        goal_region=goal * ones,
         target=target * ones,
-        reward=np.zeros(count, np.float32),
+        reward=np.float32(reward) * ones,
         next_region=next_region * ones,
         weight=np.float32(1 - lost) * ones,
         lost=np.float32(lost) * ones,
@@ -179,7 +185,7 @@ def test_what_was_not_tried_is_believed_and_what_failed_is_not():
     assert corridor([])[0, 3].argmax() == 1  # 0 -> 1 -> 2 -> 3
     q = corridor([many(1, 2, 1)])  # a wall between 1 and 2
     assert q[0, 3].max() < 0.3 * corridor([])[0, 3].max()
-    assert corridor([many(1, 2, 1), many(1, 4, 3)])[1, 3].argmax() == 4  # aiming at 4 leads to 3
+    assert corridor([many(1, 2, 1), many(1, 4, 3, goal=0)])[1, 3].argmax() == 4  # aiming at 4 leads to 3
 
 
 def test_greedy_episodes_go_where_others_went_and_by_belief_only_where_nobody_was():
@@ -197,6 +203,28 @@ def test_values_stay_as_they_are_where_nothing_is_counted_or_nothing_is_best(cha
     state = commander.init(chosen, regions=R).replace(q=state.q)
     settled = commander.settle(chosen, state, allowed, believed=jnp.ones((R, R), bool), decisions=3)
     np.testing.assert_array_equal(settled.q, state.q)
+
+
+def test_what_aiming_at_the_goal_does_tells_nothing_of_aiming_at_its_region():
+    for greedy in (False, True):
+        at_goal = corridor([many(1, 2, 2, goal=2), many(2, 3, 3)], greedy=greedy)
+        through = corridor([many(1, 2, 1, goal=2), many(2, 3, 3)], greedy=greedy)
+        np.testing.assert_array_equal(at_goal[1, 3], through[1, 3])
+        assert at_goal[1, 2, 2] > through[1, 2, 2]
+
+
+def test_where_the_goals_region_is_cut_nobody_aims_beside_the_goal():
+    """Region 2, which was only aimed at for the goal in it, is cut in two, and the goal is in the new half, 3."""
+    chosen = settings(learner="model", reward="success", discount=0.9, prior=1.0)
+    everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
+    state = commander.init(chosen, regions=R)
+    for batch in (many(0, 2, 2, goal=2, reward=0.5), many(2, 2, 2, goal=2, reward=1.0)):
+        state = commander.observe(chosen, state, everything, batch)
+    state = commander.on_split(state, parent=jnp.int32(2), child=jnp.int32(3))
+    settled = commander.settle(chosen, state, everything, believed=jnp.ones((R, R), bool), decisions=20)
+    assert settled.q[0, 3].argmax() == 3
+    assert settled.q[2, 3].argmax() == 3
+    assert settled.q[0, 2].argmax() == 2
 
 
 def test_a_command_that_ends_the_episode_is_worth_less_than_one_that_fails():
@@ -352,17 +380,21 @@ def test_the_reward_of_a_period_is_the_max_or_mean_over_all_its_steps(reward):
 
 
 def test_a_new_region_inherits_rows_columns_and_half_the_visits_of_its_parent():
-    q, led = jax.random.uniform(jax.random.key(0), (2, R, R, R))
-    model = Model(led=led, rewards=q, visits=led, lost=q[0], reach=led)
+    q, reach, *led = jax.random.uniform(jax.random.key(0), (4, R, R, R))
+    model = Model(led=jnp.stack(led), rewards=q, visits=reach, lost=jnp.stack(led)[:, 0], reach=reach)
     state = CommanderState(q=q, chosen=jnp.arange(1.0, R + 1), model=model)
     after = commander.on_split(state, parent=jnp.int32(1), child=jnp.int32(3))
     who = [0, 1, 2, 1, 4]
     share = np.where(np.isin(np.arange(R), [1, 3]), 0.5, 1.0)
-    np.testing.assert_allclose(after.model.led, np.asarray(led)[np.ix_(who, who, who)] * share)
-    np.testing.assert_array_equal(after.model.rewards, np.asarray(q)[np.ix_(who, who, who)])
-    np.testing.assert_array_equal(after.model.reach, np.asarray(led)[np.ix_(who, who, who)])
-    np.testing.assert_array_equal(after.model.lost, np.asarray(q[0])[np.ix_(who, who)])
-    np.testing.assert_array_equal(after.q, np.asarray(q)[np.ix_(who, who, who)])
+    everywhere, cube = np.ix_(range(2), who, who, who), np.ix_(who, who, who)
+    beside = np.zeros((R, R, R))  # aiming at the half where the goal is not
+    beside[:, [1, 3], [3, 1]] = 1
+    np.testing.assert_allclose(after.model.led, np.asarray(led)[everywhere] * share)
+    np.testing.assert_array_equal(after.model.rewards, np.where(beside, 0, np.asarray(q)[cube]))
+    np.testing.assert_array_equal(after.model.visits, np.where(beside, 0, np.asarray(reach)[cube]))
+    np.testing.assert_array_equal(after.model.reach, np.asarray(reach)[cube])
+    np.testing.assert_array_equal(after.model.lost, np.asarray(led)[:, 0][everywhere[:3]].reshape(2, R, R))
+    np.testing.assert_array_equal(after.q, np.asarray(q)[cube])
     np.testing.assert_array_equal(after.chosen, [1, 1, 3, 1, 5])
 
 

@@ -285,8 +285,9 @@ def test_a_disk_that_fills_up_ends_the_run_in_one_line_and_it_resumes(finished, 
     assert_same_end(part, run_dir)
 
 
-def test_a_run_of_an_older_format_goes_on_from_its_checkpoint(tmp_path, capsys):
-    run_dir = unpacked("format_2", tmp_path)
+@pytest.mark.parametrize("name", ["format_2", "format_3"])
+def test_a_run_of_an_older_format_goes_on_from_its_checkpoint(name, tmp_path, capsys):
+    run_dir = unpacked(name, tmp_path)
     before = rows(run_dir)
     result = trainer.train(tiny(), run_dir, resume=True, quiet=True)
     assert result.env_steps == 4 * EPOCH and capsys.readouterr().err == ""
