@@ -197,8 +197,7 @@ class MazeEnv(Env):
         seen = self._body.observe(data, steps)
         non_finite = ~(_all_finite(data) & jnp.isfinite(seen).all())
         overflow = ~non_finite & self._body.dropped(data)
-        mishaps = {"flipped": self._body.flipped(data), "fallen": self._body.fallen(data)}
-        mishaps = {name: ~non_finite & happened for name, happened in mishaps.items()}
+        mishaps = {name: ~non_finite & getattr(self._body, name)(data) for name in self._ends}
         going, failed = before.ended == 0, non_finite | overflow
         terminated = (before.terminated > 0) | (going & ~failed & self._ended_by(mishaps, "terminate"))
         ended = ~going | failed | terminated | self._ended_by(mishaps, "truncate")
@@ -225,8 +224,7 @@ class MazeEnv(Env):
 
     def _ended_by(self, mishaps: dict[str, jax.Array], how: str) -> jax.Array:
         """Whether one of `mishaps` is to end the episode by `how`."""
-        chosen = [happened for name, happened in mishaps.items() if self._ends[name] == how]
-        return jnp.any(jnp.stack(chosen), axis=0) if chosen else jnp.zeros((), bool)
+        return jnp.any(jnp.stack([happened & (self._ends[name] == how) for name, happened in mishaps.items()]))
 
     def _shaken(self, data: Any, noise: jax.Array) -> tuple[Any, jax.Array]:
         """`data` with noise on the body's position, and the next key."""

@@ -9,7 +9,7 @@ After k steps it learns in one of two ways. Q-learning (`q`, published), with r 
 The B environments are B streams of one table: the errors of a cell are averaged over the n decisions of a batch that
 visited it, and alpha_n = 1 - (1 - alpha)^n is the step that n updates in a row towards that average would make.
 
-Planning (`model`): where the command of a region leads does not depend on the goal, so every decision teaches about all
+Planning (`model`): where the command of a region leads does not depend on the goal, so decisions teach about all other
 goals. Counts of (i, j) -> i' and mean rewards make a model of the regions, on which value iteration runs at every
 instant:
 
@@ -53,9 +53,9 @@ class Model(struct.PyTreeNode):
     led: Float[Array, "2 R R R"]
     """Decisions by aim (0: the target region, 1: the goal in it), region, target and next region."""
     rewards: Float[Array, "R R R"]
-    """Sums of rewards by region, goal region and target."""
+    """Sums of rewards by region, goal region and target, of those that ended an episode too."""
     visits: Float[Array, "R R R"]
-    """Decisions by region, goal region and target."""
+    """Decisions by region, goal region and target, with those that ended an episode."""
     lost: Float[Array, "2 R R"]
     """Decisions by aim, region and target during which the episode was terminated."""
     reach: Float[Array, "R R R"]
@@ -89,6 +89,11 @@ class Decision(struct.PyTreeNode):
     practised: Float[Array, "N"]
     aside: Float[Array, "N"]
     shown: Float[Array, "N"] | None = None
+
+    @property
+    def at_goal(self) -> Bool[Array, "N"]:
+        """Whether the Tutor was given the goal, not the bounds of a region."""
+        return (self.target == self.goal_region) & (self.practised == 0) & (self.aside == 0)
 
 
 class Successors(struct.PyTreeNode):
@@ -208,13 +213,12 @@ def observe(
         return state if batch.shown is None else _follow_teacher(config, state, batch, batch.shown, margin)
     cell = (batch.region, batch.goal_region, batch.target)
     direct = 1 - batch.aside
-    weight = batch.weight * direct
     # Who practises and aims at the goal's region aims at its centre, which tells nothing of aiming at the goal.
-    at_goal = batch.target == batch.goal_region
-    telling = weight * (1 - batch.practised * at_goal)
-    aim = (at_goal & (batch.practised == 0)).astype(jnp.int32)
+    beside = batch.practised * (batch.target == batch.goal_region)
+    telling = jnp.maximum(batch.weight, batch.lost) * direct * (1 - beside)
+    aim = batch.at_goal.astype(jnp.int32)
     model = state.model.replace(
-        led=state.model.led.at[aim, batch.region, batch.target, batch.next_region].add(weight),
+        led=state.model.led.at[aim, batch.region, batch.target, batch.next_region].add(batch.weight * direct),
         rewards=state.model.rewards.at[cell].add(telling * batch.reward),
         visits=state.model.visits.at[cell].add(telling),
         lost=state.model.lost.at[aim, batch.region, batch.target].add(batch.lost * direct),
@@ -400,9 +404,9 @@ def on_split(state: CommanderState, *, parent: Int[Array, ""], child: Int[Array,
     What aiming at the goal in the old region paid tells nothing of aiming at the half in which the goal is not.
     """
     cells = lambda table, axes: inherit(table, parent=parent, child=child, axes=axes)  # noqa: E731
-    beside = jnp.stack([parent, child]), jnp.stack([child, parent])
     model = state.model
     if model is not None:
+        beside = jnp.stack([parent, child]), jnp.stack([child, parent])
         model = Model(
             led=cells(model.led.at[..., parent].multiply(0.5), (1, 2, 3)),
             rewards=cells(model.rewards, (0, 1, 2)).at[:, *beside].set(0.0),

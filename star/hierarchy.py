@@ -10,8 +10,8 @@
 
 Each level but the Controller can be left out (`enabled`): no Commander is HIRO, no Tutor is GARA, neither is flat.
 
-A period cut short by the end of an episode teaches neither the Commander nor the forward model, because it did not
-last k steps.
+A period cut short by the end of an episode teaches the forward model nothing, because it did not last k steps, and the
+Commander only that it was lost, if the task ended it.
 """
 
 from __future__ import annotations
@@ -277,13 +277,12 @@ def _learn_between_episodes(
     )
     periods = num_envs * (spec.episode_length // config.commander.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
-    at_goal = (decision.target == decision.goal_region) & (decision.practised == 0) & (decision.aside == 0)
-    goals = refinement.Goals.of(outcome, at_goal, radius=spec.success_radius)
+    goals = refinement.Goals.of(outcome, decision.at_goal, radius=spec.success_radius)
     if config.forward_model.boxes == "reached":
         lower, upper = (corner[decision.next_region] for corner in (state.abstraction.lower, state.abstraction.upper))
         outcome = outcome.replace(lower=lower, upper=upper)
     error = forward_model.errors(config.forward_model, state.forward_model, outcome)
-    counted = outcome.weight * (1 - decision.aside) * (at_goal == (decision.region == decision.target))
+    counted = outcome.weight * (1 - decision.aside) * (decision.at_goal == (decision.region == decision.target))
     graph = refinement.observe(
         config, state.graph, region=decision.region, target=decision.target, error=error, weight=counted
     )

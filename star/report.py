@@ -81,7 +81,7 @@ def _table(config: AgentConfig, goal: Array, episode_length: int, state: TrainSt
         "target": target,
     }
     if state.commander.model is not None:
-        tables["visited"] = state.commander.model.led.sum(axis=(0, 2, 3))
+        tables["visited"] = (state.commander.model.led.sum(axis=-1) + state.commander.model.lost).sum(axis=(0, 2))
     if state.sgim is not None:
         tables["competence"] = selection.competence(state.sgim)
         tables["drawn"] = selection.probabilities(config.sgim.selection, state.sgim).sum(axis=-1)
