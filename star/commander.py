@@ -45,6 +45,7 @@ from star.replay import weighted_mean
 Metrics = dict[str, Array]
 
 _HUNCH = 0.1  # what belief is worth where nothing is to be tried
+_HABIT = 0.1  # share by which a command that nobody follows has to be better than the usual one
 
 
 class Model(struct.PyTreeNode):
@@ -259,13 +260,17 @@ def settle(
 
     The belief that what was not tried succeeds makes agents try it, which is of no use where nothing is learnt: here it
     only decides among what is unknown. And since regions were cut and judged after the last plan, this one begins from
-    nothing. Q stays as it is without a model, and with rewards by distance, of which nothing is the best.
+    nothing. Of commands that look about as good the usual one is better known: regions are coarse, and what leads on
+    where agents stood when they tried it may lead nowhere from where they enter. So what was chosen less often is
+    worth a little less. Q stays as it is without a model, and with rewards by distance, of which nothing is the best.
     """
     if state.model is None or config.reward != "success":
         return state
     chances, reward = _expectations(config, state.model, believed, belief=_HUNCH)
-    q = _iterated(config, allowed, jnp.zeros_like(state.q)[None], reward[None], chances, sweeps=decisions)
-    return state.replace(q=q[0])
+    q = _iterated(config, allowed, jnp.zeros_like(state.q)[None], reward[None], chances, sweeps=decisions)[0]
+    visits = state.model.visits
+    usual = visits / jnp.maximum(visits.max(axis=-1, keepdims=True), 1.0)
+    return state.replace(q=q * (1 - _HABIT * (1 - usual)))
 
 
 def _expectations(

@@ -96,7 +96,10 @@ def test_periods_with_weight_0_teach_nothing(observe, learner):
 
 
 def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
-    """Value iteration from 0 over a model counted decision by decision: for the goals, and to be in their region."""
+    """Value iteration from 0 over a model counted decision by decision: for the goals, and to be in their region.
+
+    Returns both tables, and the decisions counted for each region, goal region and target.
+    """
     q, reach = np.zeros((2, R, R, R))
     reward, visits = np.zeros((2, R, R, R))
     to_region, to_goal = np.zeros((2, R, R, R + 1))
@@ -129,7 +132,7 @@ def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
                     later = (at_goal if j == g else chances) @ value[:, g]
                     q[i, g, j] = r / (visits[i, g, j] + prior) + discount * later
                     reach[i, g, j] = (i == g) + discount * chances @ chance[:, g]
-    return q, reach
+    return q, reach, visits
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -141,11 +144,12 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     believed = rng.random((R, R)) < 0.4
     state = observe(chosen, commander.init(chosen, regions=R), allowed, batch)
     planned = jax.jit(commander.plan)(chosen, state, allowed, believed=jnp.array(believed))
-    q, reach = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
+    q, reach, visits = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
     np.testing.assert_allclose(planned.q, q, rtol=1e-5)
     np.testing.assert_allclose(planned.model.reach, reach, rtol=1e-5)
     settle = partial(jax.jit(commander.settle, static_argnames="decisions"), chosen, believed=jnp.array(believed))
-    q, _ = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=4, belief=0.1)
+    q, *_ = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=4, belief=0.1)
+    q *= 0.9 + 0.1 * visits / np.maximum(visits.max(axis=-1, keepdims=True), 1.0)
     for before in (state, planned):  # whatever was planned before
         settled = settle(before, allowed, decisions=4)
         np.testing.assert_allclose(settled.q, q, rtol=1e-5, atol=1e-12)
@@ -194,6 +198,12 @@ def test_greedy_episodes_go_where_others_went_and_by_belief_only_where_nobody_wa
     assert corridor(tried, shortcut=True, greedy=True)[0, 3].argmax() == 1
     assert corridor([], shortcut=True, greedy=True)[0, 3].argmax() == 3
     assert corridor([many(0, 3, 0, count=1000)], shortcut=True, greedy=True)[0, 3].argmax() == 1
+
+
+@pytest.mark.parametrize(("arrived", "best"), [(95, 1), (1, 2)])
+def test_of_commands_about_as_good_the_usual_one_is_followed(arrived, best):
+    usual = [many(0, 1, 3, goal=3, count=arrived), many(0, 1, 0, goal=3, count=100 - arrived)]
+    assert corridor([*usual, many(0, 2, 3, goal=3, count=50)], greedy=True)[0, 3].argmax() == best
 
 
 @pytest.mark.parametrize("changed", [{"learner": "q"}, {"reward": "max"}])
