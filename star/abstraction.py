@@ -13,8 +13,10 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
@@ -125,6 +127,12 @@ def adjacent(abstraction: Abstraction) -> Bool[Array, "R R"]:
     upper = jnp.minimum(abstraction.upper[:, None], abstraction.upper[None])
     faces = jnp.all(lower <= upper, axis=-1) & (jnp.sum(lower < upper, axis=-1) == lower.shape[-1] - 1)
     return faces & abstraction.active[:, None] & abstraction.active[None]
+
+
+def origins(before: Abstraction, after: Abstraction) -> Int[Array, "R"]:
+    """The region of `before` out of which each region of `after`, made of it by splits, was cut; else its own index."""
+    cut_from = jax.vmap(partial(locate, before))(after.lower)
+    return jnp.where(after.active, cut_from, jnp.arange(after.capacity))
 
 
 def inherit(table: Array, *, parent: Array, child: Array, axes: Sequence[int]) -> Array:

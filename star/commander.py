@@ -19,8 +19,9 @@ Commanding the goal's own region is another thing, for the Tutor is then given t
 and believed to be as where the goal is elsewhere.
 The probabilities of i' sum to less than 1 where episodes were lost (terminated). What was not tried is believed to
 succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
-region gets there. `prior` decisions weigh as much as this belief. Greedy episodes, in which nothing is learnt, follow
-a plan with hardly any of it (`settle`).
+region gets there. `prior` decisions weigh as much as this belief. Where regions were cut, the epoch's decisions are
+counted anew by today's regions (`on_refined`). Greedy episodes, in which nothing is learnt, follow a plan with hardly
+any of it (`settle`).
 
 A share of the environments practises: they pursue random regions instead of the goal, by the same plan with another
 reward, 1 in the region pursued. What is hard to reach, and so unattractive to all others, is tried there.
@@ -38,7 +39,6 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from star.abstraction import inherit
 from star.config import CommanderConfig
 from star.replay import weighted_mean
 
@@ -77,7 +77,7 @@ class Decision(struct.PyTreeNode):
     `weight` is 1 where the period really lasted k env steps, `lost` is 1 where the task was terminated in it,
     `practised` is 1 where a random region was pursued instead of the goal, `aside` is 1 where what was commanded was a
     waypoint, which tells nothing of its region, and `shown` is 1 where a teacher chose the target. The reward is that
-    for the goal.
+    for the goal, which was at the point `goal`.
     """
 
     region: Int[Array, "N"]
@@ -89,6 +89,7 @@ class Decision(struct.PyTreeNode):
     lost: Float[Array, "N"]
     practised: Float[Array, "N"]
     aside: Float[Array, "N"]
+    goal: Float[Array, "N d"]
     shown: Float[Array, "N"] | None = None
 
     @property
@@ -212,19 +213,23 @@ def observe(
     if state.model is None:
         state = _q_learning(config, state, allowed, batch)
         return state if batch.shown is None else _follow_teacher(config, state, batch, batch.shown, margin)
-    cell = (batch.region, batch.goal_region, batch.target)
+    return state.replace(model=_counted(state.model, batch, cells=batch))
+
+
+def _counted(model: Model, batch: Decision, *, cells: Decision) -> Model:
+    """`model` with the decisions of `batch`, in the tables' cells that the regions of `cells` say."""
     direct = 1 - batch.aside
     # Who practises and aims at the goal's region aims at its centre, which tells nothing of aiming at the goal.
     beside = batch.practised * (batch.target == batch.goal_region)
     telling = jnp.maximum(batch.weight, batch.lost) * direct * (1 - beside)
-    aim = batch.at_goal.astype(jnp.int32)
-    model = state.model.replace(
-        led=state.model.led.at[aim, batch.region, batch.target, batch.next_region].add(batch.weight * direct),
-        rewards=state.model.rewards.at[cell].add(telling * batch.reward),
-        visits=state.model.visits.at[cell].add(telling),
-        lost=state.model.lost.at[aim, batch.region, batch.target].add(batch.lost * direct),
+    command = (batch.at_goal.astype(jnp.int32), cells.region, cells.target)
+    pursuit = (cells.region, cells.goal_region, cells.target)
+    return model.replace(
+        led=model.led.at[*command, cells.next_region].add(batch.weight * direct),
+        rewards=model.rewards.at[pursuit].add(telling * batch.reward),
+        visits=model.visits.at[pursuit].add(telling),
+        lost=model.lost.at[command].add(batch.lost * direct),
     )
-    return state.replace(model=model)
 
 
 def plan(
@@ -403,25 +408,73 @@ def accumulate(
     return reward + jnp.sum(external * alive, axis=0) / config.period
 
 
-def on_split(state: CommanderState, *, parent: Int[Array, ""], child: Int[Array, ""]) -> CommanderState:
-    """The new region inherits rows and columns of the one it was cut from; they share what arrived there.
+def on_refined(
+    config: CommanderConfig,
+    state: CommanderState,
+    earlier: Model | None,
+    batch: Decision,
+    cells: Decision,
+    origin: Int[Array, "R"],
+) -> CommanderState:
+    """The tables after an epoch whose regions were cut, so that region j of today is (a part of) `origin` [j] of then.
 
-    What aiming at the goal in the old region paid tells nothing of aiming at the half in which the goal is not.
+    Parts inherit the values of the whole. The model becomes the `earlier` one, with which the epoch began, and all
+    decisions of the epoch, `batch`, counted anew: `cells` holds them with today's regions, but for the targets, which
+    count as all their parts unless they were goals.
     """
-    cells = lambda table, axes: inherit(table, parent=parent, child=child, axes=axes)  # noqa: E731
-    model = state.model
-    if model is not None:
-        beside = jnp.stack([parent, child]), jnp.stack([child, parent])
-        model = Model(
-            led=cells(model.led.at[..., parent].multiply(0.5), (1, 2, 3)),
-            rewards=cells(model.rewards, (0, 1, 2)).at[:, *beside].set(0.0),
-            visits=cells(model.visits, (0, 1, 2)).at[:, *beside].set(0.0),
-            lost=cells(model.lost, (1, 2)),
-            reach=cells(model.reach, (0, 1, 2)),
-        )
-    return CommanderState(
-        q=cells(state.q, (0, 1, 2)), chosen=cells(state.chosen.at[parent].multiply(0.5), (0,)), model=model
+    parts = jnp.zeros(len(origin)).at[origin].add(1.0)[origin]
+    cube = (origin[:, None, None], origin[:, None], origin)
+    state = state.replace(q=state.q[cube], chosen=state.chosen[origin] / parts)
+    if state.model is None or earlier is None:
+        return state
+    counted = _counted(jax.tree.map(jnp.zeros_like, earlier), batch, cells=cells)
+    beside, own = _beside(origin), jnp.eye(len(origin), dtype=bool)
+    to_parts = lambda table: table.at[0].set(table[0][:, origin])  # noqa: E731
+    in_pursuit = lambda table: jnp.where(own, table, jnp.where(beside, 0.0, table[..., origin]))  # noqa: E731
+    new = counted.replace(
+        led=to_parts(counted.led),
+        lost=to_parts(counted.lost),
+        rewards=in_pursuit(counted.rewards),
+        visits=in_pursuit(counted.visits),
     )
+    old = _inherited(config, earlier, new, origin, parts)
+    model = jax.tree.map(jnp.add, old, new)
+    return state.replace(model=model.replace(reach=state.model.reach[cube]))
+
+
+def _inherited(
+    config: CommanderConfig, earlier: Model, new: Model, origin: Int[Array, "R"], parts: Float[Array, "R"]
+) -> Model:
+    """Counts of before the epoch that cut each `origin` into so many `parts`, beside its own counts `new`.
+
+    Nobody knows any more where in a region these decisions began and ended. So wherever a part is concerned they are
+    but a belief, of `config.prior` decisions at most, and arrived in the parts as those of the epoch did. What aiming
+    at the goal paid tells nothing of aiming at a part in which the goal is not.
+    """
+    cube = (origin[:, None, None], origin[:, None], origin)
+    arrived = jnp.zeros_like(new.led).at[..., origin].add(new.led)[..., origin]
+    share = jnp.where(arrived > 0, new.led / jnp.where(arrived > 0, arrived, 1.0), 1 / parts)
+    led, lost = earlier.led[:, *cube] * share, earlier.lost[:, *cube[1:]]
+    beside = _beside(origin)
+    rewards, visits = (jnp.where(beside, 0.0, table[cube]) for table in (earlier.rewards, earlier.visits))
+
+    cut = parts > 1
+    either = cut[:, None] | cut
+    doubt = lambda number: config.prior / jnp.maximum(number, config.prior)  # noqa: E731
+    of_commands = jnp.where(either, doubt(led.sum(axis=-1) + lost), 1.0)
+    of_pursuits = jnp.where(either | cut[:, None, None], doubt(visits), 1.0)
+    return Model(
+        led=led * of_commands[..., None],
+        lost=lost * of_commands,
+        rewards=rewards * of_pursuits,
+        visits=visits * of_pursuits,
+        reach=jnp.zeros_like(earlier.reach),
+    )
+
+
+def _beside(origin: Int[Array, "R"]) -> Bool[Array, "R R"]:
+    """Which regions are parts of the same one, and not the same."""
+    return (origin[:, None] == origin) & ~jnp.eye(len(origin), dtype=bool)
 
 
 def towards(

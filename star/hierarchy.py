@@ -28,7 +28,8 @@ from envs.batching import where
 from envs.vector import VectorEnv
 from star import abstraction as regions
 from star import adjacency, commander, controller, devices, episode, faults, forward_model, learner, refinement, tutor
-from star.commander import CommanderState, Decision, Successors
+from star.abstraction import Abstraction
+from star.commander import CommanderState, Decision, Model, Successors
 from star.config import AgentConfig
 from star.episode import Episode, Steps, Streams
 from star.forward_model import Outcome
@@ -53,6 +54,7 @@ def epoch(
     streams = devices.share(streams)
     if config.sgim.enabled:
         state, streams = _begin_lesson(config, spec, env, state, teachers, streams, key=lesson_key)
+    known = state.commander.model
     segments = spec.episode_length // config.tutor.period
     blocks = (segments // config.tutor.unroll, config.tutor.unroll)
     (state, streams), (outcomes, metrics, counts) = jax.lax.scan(
@@ -72,7 +74,7 @@ def epoch(
     outcomes = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), devices.whole(outcomes))
     if config.commander.enabled:
         epsilon = commander.epsilon(config.commander, _env_steps(spec, env, state))
-        state, more = _learn_between_episodes(config, spec, state, outcomes, env.num_envs, key=end_key)
+        state, more = _learn_between_episodes(config, spec, state, known, outcomes, env.num_envs, key=end_key)
         metrics |= more | {"commander/epsilon": epsilon}
     state = state.replace(epoch=state.epoch + 1)
     return state, metrics | faults.count(state)
@@ -260,17 +262,31 @@ def _command_better(
     if learnt.model is None:
         return learnt
 
-    def plan(learnt: CommanderState) -> CommanderState:
-        return commander.plan(config.commander, learnt, allowed, believed=episode.believed(config, state))
-
     period = config.commander.period // config.tutor.period
+    plan = partial(_plan, config, state)
     return jax.lax.cond(number % period == period - 1, plan, lambda same: same, learnt)
 
 
+def _plan(config: AgentConfig, state: TrainState, learnt: CommanderState) -> CommanderState:
+    """The Commander `learnt`, with values by what it knows now."""
+    allowed = episode.successors(config, state)
+    return commander.plan(config.commander, learnt, allowed, believed=episode.believed(config, state))
+
+
 def _learn_between_episodes(
-    config: AgentConfig, spec: Spec, state: TrainState, finished: tuple[Decision, Outcome], num_envs: int, *, key: Array
+    config: AgentConfig,
+    spec: Spec,
+    state: TrainState,
+    known: Model | None,
+    finished: tuple[Decision, Outcome],
+    num_envs: int,
+    *,
+    key: Array,
 ) -> tuple[TrainState, Metrics]:
-    """Let the forward model learn from the epoch's periods, then refine the abstraction."""
+    """Let the forward model learn from the epoch's periods, refine the abstraction, and plan in it.
+
+    `known` is the Commander's model of before the epoch.
+    """
     pick_key, train_key, refine_key = jax.random.split(key, 3)
     commander_metrics = commander.measure(
         config.commander, state.commander, episode.successors(config, state), finished[0]
@@ -290,8 +306,12 @@ def _learn_between_episodes(
     state = state.replace(forward_model=model, graph=graph)
     refine_metrics: Metrics = {}
     if config.refinement.enabled:
+        before = state.abstraction
         state, refine_metrics = refine(config, spec, state, goals, key=refine_key)
+        state = state.replace(commander=_command_in_parts(config, state, before, known, *finished))
     state = state.replace(commander=commander.fade(config.commander, state.commander))
+    if state.commander.model is not None:
+        state = state.replace(commander=_plan(config, state, state.commander))
     metrics = (
         _prefix("commander", commander_metrics)
         | _prefix("forward_model", model_metrics | {"error": jnp.sqrt(weighted_mean(error, outcome.weight))})
@@ -304,7 +324,7 @@ def _learn_between_episodes(
 def refine(
     config: AgentConfig, spec: Spec, state: TrainState, goals: refinement.Goals, *, key: Array
 ) -> tuple[TrainState, Metrics]:
-    """Examine pairs, cut regions, and let the tables that regions index follow every cut."""
+    """Examine pairs, cut regions, and let the tables of SGIM follow every cut."""
     abstraction, graph, splits, metrics = refinement.refine(
         config,
         state.abstraction,
@@ -315,18 +335,35 @@ def refine(
         weight=1.0 if state.sgim is None else strategies.urgency(config.sgim, state.sgim),
         key=key,
     )
-    Tables = tuple[CommanderState, SgimState | None]
 
-    def follow(tables: Tables, split: refinement.Split) -> tuple[Tables, None]:
-        ours, known = tables
-        after = commander.on_split(ours, parent=split.parent, child=split.child)
-        if known is not None:
-            parts, _ = regions.split(known.abstraction, split.cut, min_width=0.0)
-            known = selection.on_split(known, parts, parent=split.parent, child=split.child)
-        return where(split.done, (after, known), tables), None
+    def follow(known: SgimState, split: refinement.Split) -> tuple[SgimState, None]:
+        parts, _ = regions.split(known.abstraction, split.cut, min_width=0.0)
+        after = selection.on_split(known, parts, parent=split.parent, child=split.child)
+        return where(split.done, after, known), None
 
-    (commander_state, known), _ = jax.lax.scan(follow, (state.commander, state.sgim), splits)
-    return state.replace(abstraction=abstraction, graph=graph, commander=commander_state, sgim=known), metrics
+    known = None if state.sgim is None else jax.lax.scan(follow, state.sgim, splits)[0]
+    return state.replace(abstraction=abstraction, graph=graph, sgim=known), metrics
+
+
+def _command_in_parts(
+    config: AgentConfig,
+    state: TrainState,
+    before: Abstraction,
+    known: Model | None,
+    decision: Decision,
+    outcome: Outcome,
+) -> CommanderState:
+    """The Commander in today's regions, after an epoch with those of `before` and the model `known` at its start."""
+    find = jax.vmap(partial(regions.locate, state.abstraction))
+    goal_region = find(decision.goal)
+    cells = decision.replace(
+        region=find(outcome.start),
+        next_region=find(outcome.end),
+        goal_region=goal_region,
+        target=jnp.where(decision.at_goal, goal_region, decision.target),
+    )
+    origin = regions.origins(before, state.abstraction)
+    return commander.on_refined(config.commander, state.commander, known, decision, cells, origin)
 
 
 def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transition:
@@ -424,6 +461,7 @@ def finished_period(
         lost=lost,
         practised=(streams.practice >= 0).astype(weight.dtype),
         aside=streams.waypoint.astype(weight.dtype),
+        goal=spec.goal_point(steps.obs[0]),
         shown=None if lesson is None else strategies.guided(config.sgim, lesson).astype(weight.dtype),
     )
     outcome = Outcome(start=streams.start, lower=streams.box.lower, upper=streams.box.upper, end=end, weight=weight)

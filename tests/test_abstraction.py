@@ -151,6 +151,17 @@ def test_a_full_table_refuses_every_cut(split):
     jax.tree.map(np.testing.assert_array_equal, full, after)
 
 
+def test_each_region_has_its_origin_in_that_of_which_it_was_cut(split):
+    before = after = grid(max_regions=9)
+    origin = list(range(9))
+    for parent, where in [(2, cut(2, 1, 3.0)), (4, cut(4, 0, 12.0)), (2, cut(2, 0, 9.0)), (0, cut(0, 0, 0.0))]:
+        origin[int(after.count)] = origin[parent]
+        after, done = split(after, where, 1.0)
+        assert bool(done)
+    assert regions.origins(before, after).tolist() == origin == [0, 1, 2, 3, 2, 2, 2, 0, 8]
+    assert regions.origins(before, before).tolist() == list(range(9))
+
+
 def test_inherit_copies_along_each_axis():
     table = np.arange(9.0).reshape(3, 3)
     expected = table.copy()

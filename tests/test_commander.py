@@ -30,6 +30,7 @@ def random_batch(seed):
         lost=(rng.random(N) < 0.2).astype(np.float32),
         practised=(rng.random(N) < 0.2).astype(np.float32),
         aside=(rng.random(N) < 0.2).astype(np.float32),
+        goal=np.zeros((N, 2), np.float32),
     )
 
 
@@ -182,6 +183,7 @@ def many(region, target, next_region, *, goal=4, count=100, lost=0.0, reward=0.0
         lost=np.float32(lost) * ones,
         practised=np.zeros(count, np.float32),
         aside=np.zeros(count, np.float32),
+        goal=np.zeros((count, 2), np.float32),
     )
 
 
@@ -230,7 +232,8 @@ def test_where_the_goals_region_is_cut_nobody_aims_beside_the_goal():
     state = commander.init(chosen, regions=R)
     for batch in (many(0, 2, 2, goal=2, reward=0.5), many(2, 2, 2, goal=2, reward=1.0)):
         state = commander.observe(chosen, state, everything, batch)
-    state = commander.on_split(state, parent=jnp.int32(2), child=jnp.int32(3))
+    origin, nothing = jnp.array([0, 1, 2, 2, 4]), many(0, 0, 0, count=0)
+    state = commander.on_refined(chosen, state, state.model, nothing, nothing, origin)
     settled = commander.settle(chosen, state, everything, believed=jnp.ones((R, R), bool), decisions=20)
     for region, goal, wrong in ((0, 3, 2), (2, 3, 2), (0, 2, 3), (3, 2, 3)):
         assert settled.q[region, goal, goal] > settled.q[region, goal, wrong] + 0.6
@@ -388,23 +391,98 @@ def test_the_reward_of_a_period_is_the_max_or_mean_over_all_its_steps(reward):
         np.testing.assert_allclose(total[b], expected, rtol=1e-5)
 
 
-def test_a_new_region_inherits_rows_columns_and_half_the_visits_of_its_parent():
-    q, reach, *led = jax.random.uniform(jax.random.key(0), (4, R, R, R))
-    model = Model(led=jnp.stack(led), rewards=q, visits=reach, lost=jnp.stack(led)[:, 0], reach=reach)
-    state = CommanderState(q=q, chosen=jnp.arange(1.0, R + 1), model=model)
-    after = commander.on_split(state, parent=jnp.int32(1), child=jnp.int32(3))
-    who = [0, 1, 2, 1, 4]
-    share = np.where(np.isin(np.arange(R), [1, 3]), 0.5, 1.0)
-    everywhere, cube = np.ix_(range(2), who, who, who), np.ix_(who, who, who)
-    beside = np.zeros((R, R, R))  # aiming at the half where the goal is not
-    beside[:, [1, 3], [3, 1]] = 1
-    np.testing.assert_allclose(after.model.led, np.asarray(led)[everywhere] * share)
-    np.testing.assert_array_equal(after.model.rewards, np.where(beside, 0, np.asarray(q)[cube]))
-    np.testing.assert_array_equal(after.model.visits, np.where(beside, 0, np.asarray(reach)[cube]))
-    np.testing.assert_array_equal(after.model.reach, np.asarray(reach)[cube])
-    np.testing.assert_array_equal(after.model.lost, np.asarray(led)[:, 0][everywhere[:3]].reshape(2, R, R))
-    np.testing.assert_array_equal(after.q, np.asarray(q)[cube])
+# Regions 0, 1, 2 become 0, 1, 2 and 3, of which 1 and 3 were cut from 1; region 4 is not in use.
+ORIGIN = [0, 1, 2, 1, 4]
+
+
+def slow_recount(batch, cells, earlier, *, prior):
+    """The model after an epoch whose decisions are `batch`, in today's regions `cells`, in loops over cells."""
+    every = range(R)
+    parts = [ORIGIN.count(o) for o in ORIGIN]
+    new = {name: np.zeros_like(getattr(earlier, name)) for name in ("led", "rewards", "visits", "lost")}
+    for d in range(N):
+        if batch.aside[d]:
+            continue
+        at_goal = batch.target[d] == batch.goal_region[d] and not batch.practised[d]
+        i, g, n = cells.region[d], cells.goal_region[d], cells.next_region[d]
+        for j in [g] if at_goal else [j for j in every if ORIGIN[j] == batch.target[d]]:
+            new["led"][int(at_goal), i, j, n] += batch.weight[d]
+            new["lost"][int(at_goal), i, j] += batch.lost[d]
+            if at_goal or batch.target[d] != batch.goal_region[d]:
+                told = max(batch.weight[d], batch.lost[d])
+                new["visits"][i, g, j] += told
+                new["rewards"][i, g, j] += told * batch.reward[d]
+    model = {name: table.copy() for name, table in new.items()}
+    for i in every:
+        for j in every:
+            for aim in (0, 1):
+                whence = earlier.led[aim, ORIGIN[i], ORIGIN[j]]
+                old = np.zeros(R)
+                for n in every:
+                    siblings = [m for m in every if ORIGIN[m] == ORIGIN[n]]
+                    arrived = sum(new["led"][aim, i, j, m] for m in siblings)
+                    old[n] = whence[ORIGIN[n]] * (new["led"][aim, i, j, n] / arrived if arrived else 1 / parts[n])
+                lost = earlier.lost[aim, ORIGIN[i], ORIGIN[j]]
+                number = old.sum() + lost
+                kept = min(1.0, prior / number) if max(parts[i], parts[j]) > 1 else 1.0
+                model["led"][aim, i, j] += kept * old
+                model["lost"][aim, i, j] += kept * lost
+            for g in every:
+                if ORIGIN[g] != ORIGIN[j] or g == j:
+                    number = earlier.visits[ORIGIN[i], ORIGIN[g], ORIGIN[j]]
+                    kept = min(1.0, prior / number) if max(parts[i], parts[g], parts[j]) > 1 else 1.0
+                    model["visits"][i, g, j] += kept * number
+                    model["rewards"][i, g, j] += kept * earlier.rewards[ORIGIN[i], ORIGIN[g], ORIGIN[j]]
+    return model
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
+    chosen, batch = settings(learner="model", prior=2.0), random_batch(seed)
+    half = lambda region: np.where((region == 1) & (np.arange(N) % 3 == 0), 3, region)  # noqa: E731
+    next_region = np.minimum(batch.next_region, 2)
+    goal_region = half(batch.goal_region)
+    batch = batch.replace(next_region=next_region)
+    cells = batch.replace(
+        region=half(batch.region),
+        next_region=half(next_region),
+        goal_region=goal_region,
+        target=np.where(batch.at_goal, goal_region, batch.target),
+    )
+    q, visits, rewards, reach, *led = np.array(jax.random.uniform(jax.random.key(seed), (6, R, R, R)) * 3)
+    led, lost = np.stack(led), np.stack([visits[0], rewards[0]])
+    led[:, :, :, 3:] = led[:, 3:] = led[:, :, 3:] = 0  # nothing there
+    earlier = Model(led=led, rewards=rewards, visits=visits, lost=lost, reach=reach)
+    state = CommanderState(q=jnp.array(q), chosen=jnp.arange(1.0, R + 1), model=earlier.replace(reach=reach + 1))
+    after = jax.jit(commander.on_refined)(chosen, state, earlier, batch, cells, jnp.array(ORIGIN))
+    for name, table in slow_recount(batch, cells, earlier, prior=2.0).items():
+        np.testing.assert_allclose(getattr(after.model, name), table, rtol=1e-5, atol=1e-6)
+    cube = np.ix_(ORIGIN, ORIGIN, ORIGIN)
+    np.testing.assert_array_equal(after.q, q[cube])
+    np.testing.assert_array_equal(after.model.reach, (reach + 1)[cube])
     np.testing.assert_array_equal(after.chosen, [1, 1, 3, 1, 5])
+
+
+def test_without_cuts_counting_anew_changes_nothing():
+    chosen, batch = settings(learner="model"), random_batch(0)
+    before = commander.init(chosen, regions=R)
+    state = commander.observe(chosen, before, random_state(0)[1], batch)
+    again = commander.on_refined(chosen, state, before.model, batch, batch, jnp.arange(R))
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), again, state)
+
+
+def test_who_began_beyond_the_cut_tells_nothing_of_this_side():
+    """A wall cuts region 1 in two: from part 3 region 2 is reached, from part 1 it is not, whatever was known."""
+    chosen = settings(learner="model", prior=1.0)
+    everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
+    began = commander.observe(chosen, commander.init(chosen, regions=R), everything, many(1, 2, 2, count=1000))
+    join = partial(jax.tree.map, lambda *parts: np.concatenate(parts))
+    batch = join(many(1, 2, 1), many(1, 2, 2))
+    cells = join(many(1, 2, 1), many(3, 2, 2))
+    state = commander.observe(chosen, began, everything, batch)
+    after = commander.on_refined(chosen, state, began.model, batch, cells, jnp.array(ORIGIN))
+    led = np.asarray(after.model.led)[0, :, 2]
+    assert led[1, 2] / led[1].sum() < 0.02 and led[3, 2] / led[3].sum() > 0.98
 
 
 def test_nobody_practises_without_a_commander():

@@ -7,6 +7,8 @@ import pytest
 
 import star.state
 from star import hierarchy, loading, refinement, replay
+from star.commander import Decision
+from star.forward_model import Outcome
 from star.replay import Transition
 from star.spec import Spec
 
@@ -217,9 +219,10 @@ def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neithe
     assert epoch.traces == 1
 
 
-def test_a_split_reaches_every_table_indexed_by_regions(epoch):
+def test_after_a_split_the_commander_counts_by_the_new_regions(epoch):
     state = epoch.init(jax.random.key(0))
-    capacity = state.abstraction.capacity
+    before = state.abstraction
+    capacity = before.capacity
     count = int(state.abstraction.count)
     q = jnp.arange(float(capacity**3)).reshape(3 * (capacity,))
     # A model that predicts a step of +0.1 along x, and one due pair that it splits: region 0 and the next along x.
@@ -252,8 +255,22 @@ def test_a_split_reaches_every_table_indexed_by_regions(epoch):
     expected[count] = expected[0]
     expected[:, count] = expected[:, 0]
     expected[:, :, count] = expected[:, :, 0]
-    np.testing.assert_array_equal(after.commander.q, expected)
-    assert float(after.commander.chosen[0]) == float(after.commander.chosen[count]) == 0.5
+    # Without the overlap, in which nobody can be located: one decision from each part to the other.
+    mended = lambda table: table.replace(upper=table.upper.at[target].set(before.upper[target]))  # noqa: E731
+    after = after.replace(abstraction=mended(after.abstraction))
+    boxes = after.abstraction
+    start, end, goal = (boxes.lower[jnp.array(where)] + 0.01 for where in ([0, count], [count, 0], [target, count]))
+    ones, region = jnp.ones(2), jnp.zeros(2, jnp.int32)
+    decision = Decision(
+        region, jnp.array([target, 0]), jnp.array([target, 0]), ones, region, ones, *[0 * ones] * 3, goal=goal
+    )
+    outcome = Outcome(start=start, lower=start, upper=start, end=end, weight=ones)
+    learnt = hierarchy._command_in_parts(epoch.config.agent(), after, before, state.commander.model, decision, outcome)
+    np.testing.assert_array_equal(learnt.q, expected)
+    assert float(learnt.chosen[0]) == float(learnt.chosen[count]) == 0.5
+    led = np.argwhere(np.asarray(learnt.model.led))
+    assert led.tolist() == [[1, 0, target, count], [1, count, count, 0]]
+    assert np.argwhere(np.asarray(learnt.model.visits)).tolist() == [[0, target, target], [count, count, count]]
 
 
 @pytest.mark.parametrize("section", ["forward_model", "tutor.td3", "controller.td3"])

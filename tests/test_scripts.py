@@ -218,7 +218,7 @@ def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
     region, target, next_region = seen.T
     weight = np.array([1, 1, 1, 1, 1, 1, 1, 0, 1], np.float32)
     point = np.zeros((9, 2), np.float32)
-    unused = dict.fromkeys(("goal_region", "reward", "lost", "practised", "aside"))
+    unused = dict.fromkeys(("goal_region", "reward", "lost", "practised", "aside", "goal"))
     decision = Decision(region=region, target=target, next_region=next_region, weight=weight, **unused)
     outcome = Outcome(start=point, lower=point, upper=point, end=point + 3, weight=weight)
     walls = np.array([[2.0, -99.0, 7.5, 99.0]])

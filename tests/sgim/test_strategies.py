@@ -323,6 +323,7 @@ def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
         lost=one(0.0),
         practised=one(0.0),
         aside=one(1.0),
+        goal=jnp.zeros((1, 2)),
         shown=one(1.0),
     )
     alone = state.q[0, 1, 2]  # a waypoint tells nothing of what its region is worth
@@ -558,7 +559,7 @@ def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, bre
         np.argwhere(np.asarray(regions.adjacent(state.abstraction)) & ~np.eye(len(state.graph.told), dtype=bool))[0],
     )
     nothing = jnp.zeros(3, jnp.int32)
-    decision = commander.Decision(*[nothing] * 3, *[jnp.zeros(3)] * 1, nothing, *[jnp.zeros(3)] * 4)
+    decision = commander.Decision(*[nothing] * 3, *[jnp.zeros(3)] * 1, nothing, *[jnp.zeros(3)] * 5)
     allowed = episode.successors(agent, state)
     last = agent.commander.period // agent.tutor.period - 1
 
