@@ -447,9 +447,10 @@ def _inherited(
 ) -> Model:
     """Counts of before the epoch that cut each `origin` into so many `parts`, beside its own counts `new`.
 
-    Nobody knows any more where in a region these decisions began and ended. So wherever a part is concerned they are
-    but a belief, of `config.prior` decisions at most, and arrived in the parts as those of the epoch did. What aiming
-    at the goal paid tells nothing of aiming at a part in which the goal is not.
+    Nobody knows any more where in a region these decisions began and ended. So those that may have begun in a part are
+    but a belief in what happens there, of `config.prior` decisions at most, as are rewards where the goal may have been
+    in a part, and all arrived in the parts as those of the epoch did. What aiming at the goal paid tells nothing of
+    aiming at a part in which the goal is not.
     """
     cube = (origin[:, None, None], origin[:, None], origin)
     arrived = jnp.zeros_like(new.led).at[..., origin].add(new.led)[..., origin]
@@ -458,11 +459,10 @@ def _inherited(
     beside = _beside(origin)
     rewards, visits = (jnp.where(beside, 0.0, table[cube]) for table in (earlier.rewards, earlier.visits))
 
-    cut = parts > 1
-    either = cut[:, None] | cut
+    cut = parts[:, None] > 1
     doubt = lambda number: config.prior / jnp.maximum(number, config.prior)  # noqa: E731
-    of_commands = jnp.where(either, doubt(led.sum(axis=-1) + lost), 1.0)
-    of_pursuits = jnp.where(either | cut[:, None, None], doubt(visits), 1.0)
+    of_commands = jnp.where(cut, doubt(led.sum(axis=-1) + lost), 1.0)
+    of_pursuits = jnp.where(cut[:, None] | cut, doubt(visits), 1.0)
     return Model(
         led=led * of_commands[..., None],
         lost=lost * of_commands,

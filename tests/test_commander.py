@@ -424,13 +424,13 @@ def slow_recount(batch, cells, earlier, *, prior):
                     old[n] = whence[ORIGIN[n]] * (new["led"][aim, i, j, n] / arrived if arrived else 1 / parts[n])
                 lost = earlier.lost[aim, ORIGIN[i], ORIGIN[j]]
                 number = old.sum() + lost
-                kept = min(1.0, prior / number) if max(parts[i], parts[j]) > 1 else 1.0
+                kept = min(1.0, prior / number) if parts[i] > 1 else 1.0
                 model["led"][aim, i, j] += kept * old
                 model["lost"][aim, i, j] += kept * lost
             for g in every:
                 if ORIGIN[g] != ORIGIN[j] or g == j:
                     number = earlier.visits[ORIGIN[i], ORIGIN[g], ORIGIN[j]]
-                    kept = min(1.0, prior / number) if max(parts[i], parts[g], parts[j]) > 1 else 1.0
+                    kept = min(1.0, prior / number) if max(parts[i], parts[g]) > 1 else 1.0
                     model["visits"][i, g, j] += kept * number
                     model["rewards"][i, g, j] += kept * earlier.rewards[ORIGIN[i], ORIGIN[g], ORIGIN[j]]
     return model
