@@ -463,12 +463,11 @@ def _inherited(
     doubt = lambda number: config.prior / jnp.maximum(number, config.prior)  # noqa: E731
     of_commands = jnp.where(cut, doubt(led.sum(axis=-1) + lost), 1.0)
     of_pursuits = jnp.where(cut[:, None] | cut, doubt(visits), 1.0)
-    return Model(
+    return earlier.replace(
         led=led * of_commands[..., None],
         lost=lost * of_commands,
         rewards=rewards * of_pursuits,
         visits=visits * of_pursuits,
-        reach=jnp.zeros_like(earlier.reach),
     )
 
 

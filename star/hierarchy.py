@@ -6,7 +6,7 @@
             act (star/episode.py)
             Controller learns from the segment; where the clock reaches k, Commander learns from the period
             every `unroll` segments: Tutor learns
-        forward model learns from the epoch's periods; refinement
+        forward model learns from the epoch's periods; refinement, after which the Commander counts and plans anew
 
 Each level but the Controller can be left out (`enabled`): no Commander is HIRO, no Tutor is GARA, neither is flat.
 
@@ -263,13 +263,12 @@ def _command_better(
         return learnt
 
     period = config.commander.period // config.tutor.period
-    plan = partial(_plan, config, state)
+    plan = partial(_plan, config, state, allowed)
     return jax.lax.cond(number % period == period - 1, plan, lambda same: same, learnt)
 
 
-def _plan(config: AgentConfig, state: TrainState, learnt: CommanderState) -> CommanderState:
+def _plan(config: AgentConfig, state: TrainState, allowed: Successors, learnt: CommanderState) -> CommanderState:
     """The Commander `learnt`, with values by what it knows now."""
-    allowed = episode.successors(config, state)
     return commander.plan(config.commander, learnt, allowed, believed=episode.believed(config, state))
 
 
@@ -311,7 +310,7 @@ def _learn_between_episodes(
         state = state.replace(commander=_command_in_parts(config, state, before, known, *finished))
     state = state.replace(commander=commander.fade(config.commander, state.commander))
     if state.commander.model is not None:
-        state = state.replace(commander=_plan(config, state, state.commander))
+        state = state.replace(commander=_plan(config, state, episode.successors(config, state), state.commander))
     metrics = (
         _prefix("commander", commander_metrics)
         | _prefix("forward_model", model_metrics | {"error": jnp.sqrt(weighted_mean(error, outcome.weight))})
