@@ -33,6 +33,7 @@ START_POSITION = 0.1  # half-range of the start qpos, m and rad
 START_SPEED = 0.1  # standard deviation of the start qvel, m/s and rad/s
 STEP_SCALE = 0.001  # of the step count in the state
 ORIENTATION = (3, 4, 5, 6)  # indices of the quaternion in qpos and in the state
+VELOCITY = (15, 16)  # those in the state of the torso's velocity along x and y
 QPOS, QVEL = 15, 14  # the ant's own positions and velocities; those of blocks follow
 ON_ITS_BACK = -0.5  # the ant is flipped when the vertical part of its own up axis is below
 LIFT = 2 * HEIGHT  # how far an open gate is lifted, m
@@ -83,6 +84,7 @@ class Ant:
         self.physics = physics
         self.action_size = physics.model.nu
         self.orientation: tuple[int, ...] = ORIENTATION
+        self.velocity: tuple[int, ...] = VELOCITY
         self.dt = physics.dt
         self._arena = task.arena
         self._switch: Switch | None = task.switch

@@ -32,6 +32,8 @@ class Body(Protocol):
     action_size: int
     orientation: tuple[int, ...]
     """Where in the state the unit quaternion (w, x, y, z) of the body is; empty if it has none."""
+    velocity: tuple[int, ...]
+    """Where in the state its velocity along x and y is, in m/s and the world's axes; empty if it has no orientation."""
     dt: float
 
     @property
@@ -107,6 +109,7 @@ class MazeEnv(Env):
         self.episode_length = episode_length
         self.state_dim = body.state_dim
         self.orientation = body.orientation
+        self.velocity = body.velocity
         self.dt = body.dt
         self.success_radius = success_radius
         geometry = task.geometry

@@ -45,6 +45,7 @@ class Point:
 
     action_size = 2
     orientation: tuple[int, ...] = ()
+    velocity: tuple[int, ...] = ()
     dt = 0.1
     engine = "jax"
 

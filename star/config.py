@@ -164,6 +164,9 @@ class CommanderConfig(Section):
     epsilon_spread: bool = Field(
         True, description="spread epsilon over the environments, from none to twice as much, instead of the same in all"
     )
+    arrival: bool = Field(
+        True, description="greedy episodes: decide again as soon as the target region is reached, not after k env steps"
+    )
     hold: Literal[False, True, "region"] = Field(
         True,
         description="command the goal wherever it counts as reached (true), or instead all over its region (region)",
@@ -249,7 +252,10 @@ class ControllerConfig(LevelConfig):
     """The Controller: drives the joints towards the subgoal."""
 
     termination_penalty: float = Field(
-        2.0, ge=0, description="taken off the reward where the task is terminated, as by a flip"
+        20.0, ge=0, description="taken off the reward where the task is terminated, as by a flip"
+    )
+    frame: Literal["world", "body"] = Field(
+        "world", description="axes of velocity, tilt and subgoal as it sees them: the world's, or turned with the body"
     )
     hindsight: bool = Field(
         False, description="replay half of the transitions with a subgoal that was reached; needs learner td3"

@@ -1,6 +1,7 @@
 """The Controller: moves the body towards the subgoal at every env step, wherever it stands.
 
-    sees      the state without the abstract position, and the relative subgoal g_t
+    sees      the state without the abstract position, and the relative subgoal g_t; with `frame` body both turned about
+              z with the body, so that what was learnt in one direction holds in all
     g_{t+1} = s_t + g_t - s_{t+1}                           the subgoal stays where it is while the agent moves
     reward  = -||s_t + g_t - s_{t+1}||  (`distance`, published)   or   ||g_t|| - ||g_{t+1}||  (`progress`)
 
@@ -12,20 +13,27 @@ Source: STAR (ICLR 2024), section 4.1, after HIRO (Nachum et al. 2018), section 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from star.config import ControllerConfig
+from star.spec import Spec
 
 
 def observe(
-    state: Float[Array, "*batch state"], subgoal: Float[Array, "*batch m"], *, position: Sequence[int]
+    config: ControllerConfig, spec: Spec, state: Float[Array, "*batch state"], subgoal: Float[Array, "*batch m"]
 ) -> Float[Array, "*batch seen"]:
-    """The state without its coordinates `position`, followed by the relative subgoal."""
-    kept = np.setdiff1d(np.arange(state.shape[-1]), np.asarray(position, int))
+    """The state without its abstract coordinates, followed by the relative subgoal, both in the axes of `frame`.
+
+    A box turned with the body is no box: it is given by its nearest point and its centre instead of its corners.
+    """
+    if config.frame == "body":
+        if subgoal.shape[-1] != len(spec.scale):
+            lower, upper = jnp.split(subgoal, 2, axis=-1)
+            subgoal = jnp.concatenate([jnp.clip(0.0, lower, upper), (lower + upper) / 2], axis=-1)
+        state, subgoal = spec.turned(state, subgoal)
+    kept = np.setdiff1d(np.arange(state.shape[-1]), np.asarray(spec.abstract_indices, int))
     return jnp.concatenate([state[..., kept], subgoal], axis=-1)
 
 

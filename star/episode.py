@@ -128,7 +128,8 @@ def play(
         streams, steps = rollout(
             config, spec, env, state, streams, subgoal, deterministic=True, record=record, key=rollout_key
         )
-        return advance(config, streams), steps.recorded
+        streams = ahead_of_time(config, spec, state.abstraction, advance(config, streams))
+        return streams, steps.recorded
 
     segments = spec.episode_length // config.tutor.period
     streams, recorded = jax.lax.scan(segment, streams, jax.random.split(scan_key, segments))
@@ -305,7 +306,7 @@ def rollout(
     def step(carry: tuple[EnvState, Array, Array, Episode], step_key: Array) -> tuple[tuple, Steps]:
         env_state, subgoal, alive, episode = carry
         obs = env_state.obs
-        seen = controller.observe(spec.state(obs), subgoal, position=spec.abstract_indices)
+        seen = controller.observe(config.controller, spec, spec.state(obs), subgoal)
         action = learner.act(config.controller, state.controller, seen, deterministic=deterministic, key=step_key)
         recorded = record(env_state, subgoal, streams.box, action) if record else None
         env_state = env.step(env_state, action)
@@ -338,6 +339,18 @@ def rollout(
 def advance(config: AgentConfig, streams: Streams) -> Streams:
     """Move the clocks on by one segment; they return to 0 at the end of a period."""
     return streams.replace(clock=(streams.clock + config.tutor.period) % config.commander.period)
+
+
+def ahead_of_time(config: AgentConfig, spec: Spec, abstraction: Abstraction, streams: Streams) -> Streams:
+    """With `commander.arrival`, clocks at 0 where the target region is reached, unless the goal is aimed at in it.
+
+    For greedy episodes alone: what the forward model learns of is where whole periods lead.
+    """
+    if not config.commander.arrival:
+        return streams
+    region = jax.vmap(partial(regions.locate, abstraction))(spec.abstract(streams.env.obs))
+    arrived = (region == streams.target) & (streams.target != streams.goal_region)
+    return streams.replace(clock=jnp.where(arrived, 0, streams.clock))
 
 
 def restart_ended(spec: Spec, env: VectorEnv, streams: Streams, steps: Steps, *, key: Array) -> Streams:

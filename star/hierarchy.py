@@ -144,7 +144,7 @@ def _imitation(
         share = strategies.mimicking(config.sgim, lesson, number)
         batches.append(
             Imitation(
-                obs=controller.observe(drawn.state, subgoal, position=spec.abstract_indices),
+                obs=controller.observe(config.controller, spec, drawn.state, subgoal),
                 action=drawn.action,
                 weight=jnp.full(len(position), config.sgim.imitation * share),
             )
@@ -366,7 +366,7 @@ def _command_in_parts(
 
 
 def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transition:
-    observe = partial(controller.observe, position=spec.abstract_indices)
+    observe = partial(controller.observe, config.controller, spec)
     last = jnp.zeros_like(steps.alive).at[-1].set(1.0)
     return Transition(
         obs=observe(spec.state(steps.obs), steps.subgoal),
@@ -478,7 +478,7 @@ def _relabel(config: AgentConfig, spec: Spec, state: TrainState) -> Any:
     """The Tutor's off-policy correction under today's Controller."""
 
     def mean_action(states: Array, subgoals: Array) -> Array:
-        seen = controller.observe(states, subgoals, position=spec.abstract_indices)
+        seen = controller.observe(config.controller, spec, states, subgoals)
         return learner.act(config.controller, state.controller, seen, deterministic=True, key=state.key)
 
     def relabel(batch: Transition, key: Array) -> Transition:

@@ -27,6 +27,8 @@ class Spec:
     success_radius: float
     orientation: tuple[int, ...] = ()
     """Indices of the body's unit quaternion (w, x, y, z) in the state; empty if it has none."""
+    velocity: tuple[int, ...] = ()
+    """Indices of the body's velocity along x and y, in the world's axes; empty if it has no orientation."""
     heading: float | None = None
     """Length, in m, of the heading vector that subgoals set too; None if they do not."""
 
@@ -44,6 +46,7 @@ class Spec:
             region_cuts=tuple(tuple(cut) for cut in env.region_cuts),
             success_radius=float(env.success_radius),
             orientation=tuple(env.orientation),
+            velocity=tuple(env.velocity),
             heading=heading,
         )
 
@@ -83,6 +86,32 @@ class Spec:
         facing = yaw(obs[..., np.asarray(self.orientation)])
         ahead = self.heading * jnp.stack([jnp.cos(facing), jnp.sin(facing)], axis=-1)
         return jnp.concatenate([self.abstract(obs), ahead], axis=-1)
+
+    def turned(
+        self, state: Float[Array, "*batch state"], ways: Float[Array, "*batch m"]
+    ) -> tuple[Float[Array, "*batch state"], Float[Array, "*batch m"]]:
+        """`state` and `ways`, abstract ones or subgoals one after another, turned about z until the body's yaw is 0.
+
+        Of the velocity are left the parts ahead and to the left, of the orientation the tilt, with the real part >= 0.
+        """
+        quaternion = state[..., np.asarray(self.orientation)]
+        facing = yaw(quaternion)
+        w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+        cos, sin = jnp.cos(facing / 2), jnp.sin(facing / 2)
+        tilt = jnp.stack([cos * w + sin * z, cos * x + sin * y, cos * y - sin * x, cos * z - sin * w], axis=-1)
+        tilt = jnp.where(tilt[..., :1] < 0, -tilt, tilt)
+
+        def turn(way: Array) -> Array:
+            cos, sin = jnp.cos(facing), jnp.sin(facing)
+            ahead, left = cos * way[..., 0] + sin * way[..., 1], cos * way[..., 1] - sin * way[..., 0]
+            return jnp.stack([ahead, left], axis=-1)
+
+        velocity = np.asarray(self.velocity)
+        state = state.at[..., velocity].set(turn(state[..., velocity]))
+        state = state.at[..., np.asarray(self.orientation)].set(tilt)
+        for first in range(0, ways.shape[-1], len(self.abstract_indices)):  # also where headings begin
+            ways = ways.at[..., first : first + 2].set(turn(ways[..., first : first + 2]))
+        return state, ways
 
     def towards(self, obs: Float[Array, "*batch obs"], point: Float[Array, "*batch d"]) -> Float[Array, "*batch p"]:
         """From the pose to that of having come straight to the abstract `point`, looking ahead."""

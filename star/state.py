@@ -81,6 +81,8 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(f"commander.period: {config.commander.period} exceeds the episode of {spec.episode_length}")
     if spec.heading and not spec.orientation:
         raise ValueError(f"tutor.heading: {spec.heading:g}, but the body has no orientation; allowed: null")
+    if config.controller.frame == "body" and not spec.orientation:
+        raise ValueError("controller.frame: body, but the body has no orientation; allowed: world")
     cells = int(np.prod(adjacency.shape(config.tutor.adjacency, spec.space)))
     if config.tutor.adjacency.enabled and cells > adjacency.MAX_CELLS:
         raise ValueError(
@@ -122,7 +124,7 @@ def examples(config: AgentConfig, spec: Spec) -> tuple[Transition, Transition]:
     if config.tutor.off_policy_correction:
         extras = trace
     subgoal = jnp.zeros(p if config.tutor.enabled else 2 * d)
-    seen_by_controller = controller.observe(jnp.zeros(spec.state_dim), subgoal, position=spec.abstract_indices)
+    seen_by_controller = controller.observe(config.controller, spec, jnp.zeros(spec.state_dim), subgoal)
     return (
         Transition(obs=seen_by_tutor, action=jnp.zeros(p), next_obs=seen_by_tutor, extras=extras, **rest),
         Transition(

@@ -68,7 +68,7 @@ class Fused:
     def __init__(self, body):
         self._body = body
         self.state_dim, self.action_size, self.dt, self.engine = body.state_dim, body.action_size, body.dt, body.engine
-        self.orientation = body.orientation
+        self.orientation, self.velocity = body.orientation, body.velocity
 
     def init(self, rng, position):
         fuses = jnp.array([2.0, 6.0, -2.0, -4.0, -6.0, 1e6, 1e6, 1e6])

@@ -1,20 +1,84 @@
 """The Controller's view, its moving subgoal and its reward."""
 
+from functools import partial
+
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from star import controller, loading
+import envs
+from star import controller, loading, state
+from star.spec import Spec
 
 
 def settings(**values):
     return loading.parse({"controller": values}).controller
 
 
+def knowledge(*, abstract=(0, 1), heading=None, state_dim=12):
+    """A body whose state is x, y, z, a quaternion, the velocity along x, y and z, and the rest."""
+    d = len(abstract)
+    return Spec(
+        state_dim=state_dim,
+        action_size=1,
+        episode_length=1,
+        abstract_indices=abstract,
+        goal_indices=abstract,
+        subgoal_scale=(1.0,) * d,
+        space=((0.0,) * d, (1.0,) * d),
+        region_cuts=((),) * d,
+        success_radius=1.0,
+        orientation=(3, 4, 5, 6),
+        velocity=(7, 8),
+        heading=heading,
+    )
+
+
 def test_it_sees_the_state_without_position_then_the_subgoal():
     state, subgoal = jnp.arange(12.0).reshape(2, 6), jnp.array([[90.0, 91.0], [92.0, 93.0]])
-    seen = controller.observe(state, subgoal, position=(0, 2))
+    seen = controller.observe(settings(frame="world"), knowledge(abstract=(0, 2)), state, subgoal)
     np.testing.assert_array_equal(seen, [[1, 3, 4, 5, 90, 91], [7, 9, 10, 11, 92, 93]])
+
+
+def turned(angle, vector):
+    """[..., 2] turned by `angle` in rad."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.asarray(vector) @ np.array([[cos, sin], [-sin, cos]])
+
+
+@given(
+    angle=st.floats(-9, 9),
+    seed=st.integers(0, 99),
+    sign=st.sampled_from([-1.0, 1.0]),
+    layout=st.sampled_from([((0, 1), None), ((0, 1, 2), None), ((0, 1), 2.0), ((0, 1, 2), 3.0)]),
+)
+def test_in_the_bodys_axes_the_world_may_be_turned_about_it(angle, seed, sign, layout):
+    rng = np.random.default_rng(seed)
+    spec = knowledge(abstract=layout[0], heading=layout[1])
+    state, subgoal = rng.normal(size=12), rng.normal(size=len(spec.scale))
+    tilted = np.array([1.0, *rng.uniform(-0.3, 0.3, 2), 0.0])
+    state[3:7] = tilted / np.linalg.norm(tilted)
+    other, way, about = state.copy(), subgoal.copy(), np.zeros(4)
+    mujoco.mju_axisAngle2Quat(about, np.array([0.0, 0, 1]), angle)
+    mujoco.mju_mulQuat(other[3:7], about, state[3:7])
+    other[3:7] *= sign  # the same orientation
+    other[7:9], way[:2] = turned(angle, state[7:9]), turned(angle, subgoal[:2])
+    if spec.heading:
+        way[-2:] = turned(angle, subgoal[-2:])
+    see = partial(controller.observe, settings(frame="body"), spec)
+    seen = see(jnp.asarray(state), jnp.asarray(subgoal))
+    np.testing.assert_allclose(seen, see(jnp.asarray(other), jnp.asarray(way)), atol=1e-4)
+
+
+def test_in_the_bodys_axes_what_is_ahead_comes_first_and_boxes_are_their_nearest_point_and_centre():
+    half = np.sqrt(0.5)
+    state = jnp.array([0.0, 0, 0.5, half, 0, 0, half, 0.0, 2.0, 0.3, 7.0, 8.0])  # faces +y, moves along it at 2 m/s
+    box = jnp.array([-3.0, 1.0, 1.0, 5.0])
+    seen = controller.observe(settings(frame="body"), knowledge(), state, box)
+    np.testing.assert_allclose(seen, [0.5, 1, 0, 0, 0, 2, 0, 0.3, 7, 8, 1, 0, 3, 1], atol=1e-6)
 
 
 def test_the_subgoal_stays_where_it_is_in_the_world():
@@ -44,3 +108,9 @@ def test_a_box_in_place_of_a_subgoal_moves_whole_and_is_as_far_as_its_nearest_po
     np.testing.assert_allclose(moved, box - np.array([1, 2, 1, 2]))
     got = controller.reward(settings(reward="progress", reward_scale=1.0), box, moved, size=2)
     np.testing.assert_allclose(got, [1.0, -1.0, 5.0 - np.hypot(4, 2)], rtol=1e-6)
+
+
+def test_a_body_that_faces_nowhere_has_no_axes_of_its_own():
+    point = Spec.of(envs.make("point_maze"))
+    with pytest.raises(ValueError, match="controller.frame: body, but the body has no orientation; allowed: world"):
+        state.check(loading.parse({"controller": {"frame": "body"}}), point)

@@ -1,5 +1,7 @@
 """The clocks of the levels, the moving subgoal and the statistics, against loops written from the equations."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -274,3 +276,32 @@ def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_e
     held = inside if hold == "region" else (np.arange(B) < 4) & hold
     np.testing.assert_array_equal(at_goal[free], held[free])
     np.testing.assert_array_equal(sent[free], ~held[free])
+
+
+@pytest.mark.parametrize("arrival", [True, False])
+def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, tiny, arrival, monkeypatch):
+    agent = loading.parse(tiny, {"commander.arrival": arrival}).agent()
+    spec = replace(Spec.of(breaking_env.env), episode_length=7 * L)
+
+    def played(key):
+        state = star.state.init(agent, spec, key=key)
+        stay = jnp.broadcast_to(jnp.eye(state.abstraction.capacity)[:, None], state.commander.q.shape)
+        monkeypatch.setattr(episode, "settled", lambda *_, **__: state.commander.replace(q=stay))
+        look = lambda env_state, subgoal, box, action: (spec.abstract(env_state.obs), box)  # noqa: E731
+        return state.abstraction, *episode.play(agent, spec, breaking_env, state, record=look, key=key)
+
+    abstraction, streams, (path, box) = jax.device_get(jax.jit(played)(jax.random.key(4)))
+    path = np.concatenate([path[::L], spec.abstract(streams.env.obs)[None]])  # where each segment begins, and the end
+    lower, early = box.lower[::L], 0
+    for b in range(B):
+        clock = 0
+        goal = slow_locate(abstraction, spec.goal_point(streams.env.obs)[b])
+        for i in range(7):
+            if clock != 0:
+                np.testing.assert_array_equal(lower[i, b], lower[i - 1, b])
+            clock = (clock + L) % K
+            aimed = [j for j in range(abstraction.count) if (abstraction.lower[j] == lower[i, b]).all()]
+            if arrival and clock and aimed == [slow_locate(abstraction, path[i + 1, b])] != [goal]:
+                clock, early = 0, early + 1
+        assert streams.clock[b] == clock
+    assert (0 < early < 7 * B) == arrival
