@@ -172,16 +172,19 @@ def act(
     *,
     practised: Int[Array, "B"] | None = None,
     attraction: Float[Array, "R"] | None = None,
+    worth: Float[Array, "B R"] | None = None,
     epsilon: Float[Array, "B"] | float,
     key: Array,
 ) -> Int[Array, "B"]:
     """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random.
 
     Random ones are drawn evenly, or in proportion to `attraction`. `practised` are regions to pursue instead of the
-    goal where they are not negative.
+    goal where they are not negative. `worth`, from 0 to 1, makes less of the values.
     """
     explore_key, random_key, tie_key = jax.random.split(key, 3)
     values = state.q[region, goal_region]
+    if worth is not None:
+        values -= (1 - worth) * jnp.abs(values)
     if practised is not None:
         reach = state.q if state.model is None else state.model.reach
         values = jnp.where((practised >= 0)[:, None], reach[region, practised], values)
@@ -259,9 +262,9 @@ def settle(
     allowed: Successors,
     *,
     believed: Bool[Array, "R R"],
-    decisions: int,
+    periods: int,
 ) -> CommanderState:
-    """The Commander for greedy episodes of so many `decisions`, with Q by what commands have led to.
+    """The Commander for greedy episodes of so many `periods`, with Q by what commands have led to.
 
     The belief that what was not tried succeeds makes agents try it, which is of no use where nothing is learnt: here it
     only decides among what is unknown. And since regions were cut and judged after the last plan, this one begins from
@@ -272,7 +275,7 @@ def settle(
     if state.model is None or config.reward != "success":
         return state
     chances, reward = _expectations(config, state.model, believed, belief=_HUNCH)
-    q = _iterated(config, allowed, jnp.zeros_like(state.q)[None], reward[None], chances, sweeps=decisions)[0]
+    q = _iterated(config, allowed, jnp.zeros_like(state.q)[None], reward[None], chances, sweeps=periods)[0]
     visits = state.model.visits
     usual = visits / jnp.maximum(visits.max(axis=-1, keepdims=True), 1.0)
     return state.replace(q=q * (1 - _HABIT * (1 - usual)))

@@ -167,6 +167,9 @@ class CommanderConfig(Section):
     arrival: bool = Field(
         True, description="greedy episodes: decide again as soon as the target region is reached, not after k env steps"
     )
+    retry: float = Field(
+        0.9, ge=0, le=1, description="greedy episodes: what a command is worth where it was given before and led back"
+    )
     hold: Literal[False, True, "region"] = Field(
         True,
         description="command the goal wherever it counts as reached (true), or instead all over its region (region)",
@@ -260,6 +263,12 @@ class ControllerConfig(LevelConfig):
     hindsight: bool = Field(
         False, description="replay half of the transitions with a subgoal that was reached; needs learner td3"
     )
+
+    @model_validator(mode="after")
+    def _hindsight_needs_the_axes_of_the_world(self) -> Self:
+        if self.hindsight and self.frame != "world":
+            raise ValueError("hindsight needs frame world: where a body stood is not replayed, and so not turned")
+        return self
 
     @model_validator(mode="after")
     def _hindsight_needs_replay(self) -> Self:

@@ -26,12 +26,13 @@ def observe(
 ) -> Float[Array, "*batch seen"]:
     """The state without its abstract coordinates, followed by the relative subgoal, both in the axes of `frame`.
 
-    A box turned with the body is no box: it is given by its nearest point and its centre instead of its corners.
+    A box turned with the body is no box: it is given by its nearest point and its centre instead of its corners. What
+    a full state holds of blocks stays in the world's axes.
     """
     if config.frame == "body":
         if subgoal.shape[-1] != len(spec.scale):
-            lower, upper = jnp.split(subgoal, 2, axis=-1)
-            subgoal = jnp.concatenate([jnp.clip(0.0, lower, upper), (lower + upper) / 2], axis=-1)
+            centre = sum(jnp.split(subgoal, 2, axis=-1)) / 2
+            subgoal = jnp.concatenate([nearest(subgoal, size=len(spec.scale)), centre], axis=-1)
         state, subgoal = spec.turned(state, subgoal)
     kept = np.setdiff1d(np.arange(state.shape[-1]), np.asarray(spec.abstract_indices, int))
     return jnp.concatenate([state[..., kept], subgoal], axis=-1)
@@ -45,12 +46,17 @@ def next_subgoal(
     return subgoal - moved
 
 
+def nearest(subgoal: Float[Array, "*batch m"], *, size: int) -> Float[Array, "*batch size"]:
+    """A subgoal of `size` = d coordinates, or the nearest point of a box given by two corners."""
+    if subgoal.shape[-1] == size:
+        return subgoal
+    lower, upper = jnp.split(subgoal, 2, axis=-1)
+    return jnp.maximum(lower, 0.0) + jnp.minimum(upper, 0.0)
+
+
 def distance(subgoal: Float[Array, "*batch m"], *, size: int) -> Float[Array, "*batch"]:
     """Distance to a subgoal of `size` = d coordinates, or to a box given by two corners."""
-    if subgoal.shape[-1] == size:
-        return jnp.linalg.norm(subgoal, axis=-1)
-    lower, upper = jnp.split(subgoal, 2, axis=-1)
-    return jnp.linalg.norm(jnp.maximum(lower, 0.0) - jnp.minimum(upper, 0.0), axis=-1)
+    return jnp.linalg.norm(nearest(subgoal, size=size), axis=-1)
 
 
 def reward(

@@ -52,6 +52,8 @@ class Streams(struct.PyTreeNode):
     """Whether the box is that around a waypoint, not the target region or the goal's."""
     episode: Episode
     lesson: Lesson | None = None
+    past: Int[Array, "B N 2"] | None = None
+    """In greedy episodes the last regions that were left and the targets then; -1 before."""
 
 
 class Episode(struct.PyTreeNode):
@@ -118,6 +120,7 @@ def play(
     """
     reset_key, scan_key = jax.random.split(key)
     streams = start(spec, env, goals=goals, key=reset_key)
+    streams = remembering(config, spec, state.abstraction, streams)
     allowed = successors(config, state)
     state = state.replace(commander=settled(config, state, episode_length=spec.episode_length))
 
@@ -191,7 +194,7 @@ def settled(config: AgentConfig, state: TrainState, *, episode_length: int) -> C
         state.commander,
         successors(config, state),
         believed=believed(config, state),
-        decisions=episode_length // config.commander.period,
+        periods=episode_length // config.commander.period,
     )
 
 
@@ -210,11 +213,15 @@ def command(
     locate = jax.vmap(partial(regions.locate, state.abstraction))
     aim = spec.goal_point(obs)
     region, goal_region = locate(spec.abstract(obs)), locate(aim)
-    target, practice, lesson = goal_region, streams.practice, streams.lesson
+    target, practice, lesson, past = goal_region, streams.practice, streams.lesson, streams.past
     if config.commander.enabled:
         act_key, practice_key = jax.random.split(key)
         another = jax.random.randint(practice_key, practice.shape, 0, state.abstraction.count)
         practice = jnp.where((practice == region) | (practice == _ANY), another, practice)
+        worth = None
+        if past is not None:
+            past = _left(past, streams, region)
+            worth = config.commander.retry ** _tries(past, region, regions=state.abstraction.capacity)
         target = commander.act(
             state.commander,
             allowed,
@@ -222,6 +229,7 @@ def command(
             goal_region,
             practised=practice,
             attraction=None if state.sgim is None else strategies.attraction(config.sgim, state.sgim),
+            worth=worth,
             epsilon=epsilon,
             key=act_key,
         )
@@ -251,8 +259,30 @@ def command(
         waypoint=to_point,
         episode=streams.episode,
         lesson=lesson,
+        past=past,
     )
     return _select(streams.clock == 0, fresh, streams)
+
+
+def remembering(config: AgentConfig, spec: Spec, abstraction: Abstraction, streams: Streams) -> Streams:
+    """Fresh `streams` of a greedy episode, with an empty memory of the Commander's decisions."""
+    if not config.commander.enabled:
+        return streams
+    here = jax.vmap(partial(regions.locate, abstraction))(spec.abstract(streams.env.obs))
+    decisions = spec.episode_length // config.tutor.period
+    return streams.replace(region=here, past=jnp.full((len(here), decisions, 2), -1))
+
+
+def _left(past: Int[Array, "B N 2"], streams: Streams, region: Int[Array, "B"]) -> Int[Array, "B N 2"]:
+    """`past` and the last decision, where the agent is in another `region` by now."""
+    last = jnp.stack([streams.region, streams.target], axis=-1)
+    return where(region != streams.region, jnp.concatenate([past[:, 1:], last[:, None]], axis=1), past)
+
+
+def _tries(past: Int[Array, "B N 2"], region: Int[Array, "B"], *, regions: int) -> Float[Array, "B R"]:
+    """How often `region` was left under each of the commands: all in vain, as the agent is there again."""
+    again = (past[..., 0] == region[:, None]).astype(jnp.float32)
+    return jax.vmap(lambda target, weight: jnp.zeros(regions).at[target].add(weight))(past[..., 1], again)
 
 
 def target_box(
@@ -344,7 +374,7 @@ def advance(config: AgentConfig, streams: Streams) -> Streams:
 def ahead_of_time(config: AgentConfig, spec: Spec, abstraction: Abstraction, streams: Streams) -> Streams:
     """With `commander.arrival`, clocks at 0 where the target region is reached, unless the goal is aimed at in it.
 
-    For greedy episodes alone: what the forward model learns of is where whole periods lead.
+    For greedy episodes alone: the forward model learns where whole periods lead.
     """
     if not config.commander.arrival:
         return streams

@@ -81,7 +81,7 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(f"commander.period: {config.commander.period} exceeds the episode of {spec.episode_length}")
     if spec.heading and not spec.orientation:
         raise ValueError(f"tutor.heading: {spec.heading:g}, but the body has no orientation; allowed: null")
-    if config.controller.frame == "body" and not spec.orientation:
+    if config.controller.frame == "body" and not (spec.orientation and spec.velocity):
         raise ValueError("controller.frame: body, but the body has no orientation; allowed: world")
     cells = int(np.prod(adjacency.shape(config.tutor.adjacency, spec.space)))
     if config.tutor.adjacency.enabled and cells > adjacency.MAX_CELLS:

@@ -152,7 +152,7 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     q, *_ = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=4, belief=0.1)
     q *= 0.9 + 0.1 * visits / np.maximum(visits.max(axis=-1, keepdims=True), 1.0)
     for before in (state, planned):  # whatever was planned before
-        settled = settle(before, allowed, decisions=4)
+        settled = settle(before, allowed, periods=4)
         np.testing.assert_allclose(settled.q, q, rtol=1e-5, atol=1e-12)
         np.testing.assert_array_equal(settled.model.reach, before.model.reach)
 
@@ -167,7 +167,7 @@ def corridor(batch_of, *, shortcut=False, greedy=False):
     for batch in batch_of:
         state = commander.observe(chosen, state, everything, batch)
     if greedy:
-        return commander.settle(chosen, state, everything, believed=jnp.array(neighbours), decisions=10).q
+        return commander.settle(chosen, state, everything, believed=jnp.array(neighbours), periods=10).q
     return commander.plan(chosen, state, everything, believed=jnp.array(neighbours)).q
 
 
@@ -213,7 +213,7 @@ def test_values_stay_as_they_are_where_nothing_is_counted_or_nothing_is_best(cha
     chosen = settings(**{"learner": "model", "reward": "success"} | changed)
     state, allowed = random_state(0)
     state = commander.init(chosen, regions=R).replace(q=state.q)
-    settled = commander.settle(chosen, state, allowed, believed=jnp.ones((R, R), bool), decisions=3)
+    settled = commander.settle(chosen, state, allowed, believed=jnp.ones((R, R), bool), periods=3)
     np.testing.assert_array_equal(settled.q, state.q)
 
 
@@ -234,7 +234,7 @@ def test_where_the_goals_region_is_cut_nobody_aims_beside_the_goal():
         state = commander.observe(chosen, state, everything, batch)
     origin, nothing = jnp.array([0, 1, 2, 2, 4]), many(0, 0, 0, count=0)
     state = commander.on_refined(chosen, state, state.model, nothing, nothing, origin)
-    settled = commander.settle(chosen, state, everything, believed=jnp.ones((R, R), bool), decisions=20)
+    settled = commander.settle(chosen, state, everything, believed=jnp.ones((R, R), bool), periods=20)
     for region, goal, wrong in ((0, 3, 2), (2, 3, 2), (0, 2, 3), (3, 2, 3)):
         assert settled.q[region, goal, goal] > settled.q[region, goal, wrong] + 0.6
 

@@ -305,3 +305,42 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
                 clock, early = 0, early + 1
         assert streams.clock[b] == clock
     assert (0 < early < 7 * B) == arrival
+
+
+@pytest.mark.parametrize("retry", [0.9, 0.5, 1.0])
+def test_who_comes_back_to_a_region_makes_less_of_what_it_was_told_there(breaking_env, tiny, retry):
+    agent = loading.parse(tiny, {"commander.retry": retry, "commander.hold": False}).agent()
+    spec = replace(Spec.of(breaking_env.env), episode_length=40 * L)
+    state = star.state.init(agent, spec, key=jax.random.key(0))
+    n, rng = int(state.abstraction.count), np.random.default_rng(0)
+    q = rng.uniform(-1, 1, state.commander.q.shape).astype(np.float32)
+    state = state.replace(commander=state.commander.replace(q=jnp.asarray(q)))
+    middles = (state.abstraction.lower + state.abstraction.upper) / 2
+    allowed = np.asarray(episode.successors(agent, state).greedy)
+    route = rng.integers(0, 3, (25, B))  # regions in which decisions are made
+
+    def told(streams, where):
+        obs = streams.env.obs.at[:, np.asarray(spec.abstract_indices)].set(middles[where])
+        streams = streams.replace(env=streams.env.replace(obs=obs), clock=jnp.zeros(B, jnp.int32))
+        return episode.command(
+            agent, spec, state, episode.successors(agent, state), streams, epsilon=0.0, key=jax.random.key(1)
+        )
+
+    streams = episode.start(spec, breaking_env, key=jax.random.key(2))
+    streams, told = episode.remembering(agent, spec, state.abstraction, streams), jax.jit(told)
+    goal = [slow_locate(state.abstraction, point) for point in np.asarray(spec.goal_point(streams.env.obs))]
+    tried, before, changed = np.zeros((B, n, n)), np.asarray(streams.region), 0
+    target = np.zeros(B, int)
+    for now in route:
+        streams = told(streams, now)
+        for b in range(B):
+            if now[b] != before[b]:
+                tried[b, before[b], target[b]] += 1
+            values = q[now[b], goal[b], :n]
+            known = values - (1 - retry ** tried[b, now[b]]) * np.abs(values)
+            may = allowed[now[b], :n] | (np.arange(n) == now[b])
+            best = int(np.argmax(np.where(may, known, -np.inf)))
+            assert streams.target[b] == best
+            changed += best != int(np.argmax(np.where(may, values, -np.inf)))
+        before, target = now, np.asarray(streams.target)
+    assert (changed > 20) == (retry < 1)
