@@ -148,7 +148,7 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     q, reach, visits = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
     np.testing.assert_allclose(planned.q, q, rtol=1e-5)
     np.testing.assert_allclose(planned.model.reach, reach, rtol=1e-5)
-    settle = partial(jax.jit(commander.settle, static_argnames="decisions"), chosen, believed=jnp.array(believed))
+    settle = partial(jax.jit(commander.settle, static_argnames="periods"), chosen, believed=jnp.array(believed))
     q, *_ = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=4, belief=0.1)
     q *= 0.9 + 0.1 * visits / np.maximum(visits.max(axis=-1, keepdims=True), 1.0)
     for before in (state, planned):  # whatever was planned before
