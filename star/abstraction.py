@@ -85,17 +85,17 @@ def create(space: tuple[ArrayLike, ArrayLike], cuts: Sequence[Sequence[float]], 
     )
 
 
-def locate(abstraction: Abstraction, point: Float[Array, "d"]) -> Int[Array, ""]:
-    """Index of the active region that holds `point`.
+def locate(abstraction: Abstraction, point: Float[Array, "*batch d"]) -> Int[Array, "*batch"]:
+    """Index of the active region that holds each `point`.
 
     Boxes cover the space without overlap, so the answer is unique; a point outside the space goes to the region
     nearest to it.
     """
     low, high = abstraction.space
-    inside = jnp.clip(point, low, high)
+    inside = jnp.clip(point, low, high)[..., None, :]
     below_upper = (inside < abstraction.upper) | (abstraction.upper >= high)
     holds = jnp.all((abstraction.lower <= inside) & below_upper, axis=-1)
-    return jnp.argmax(holds & abstraction.active)
+    return jnp.argmax(holds & abstraction.active, axis=-1)
 
 
 def split(abstraction: Abstraction, cut: Cut, *, min_width: float | Array) -> tuple[Abstraction, Bool[Array, ""]]:

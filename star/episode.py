@@ -119,8 +119,9 @@ def play(
     place of those that the task draws; the starts stay the same.
     """
     reset_key, scan_key = jax.random.split(key)
+    segments = spec.episode_length // config.tutor.period
     streams = start(spec, env, goals=goals, key=reset_key)
-    streams = remembering(config, spec, state.abstraction, streams)
+    streams = streams.replace(past=jnp.full((env.num_envs, segments, 2), -1))
     allowed = successors(config, state)
     state = state.replace(commander=settled(config, state, episode_length=spec.episode_length))
 
@@ -134,7 +135,6 @@ def play(
         streams = ahead_of_time(config, spec, state.abstraction, advance(config, streams))
         return streams, steps.recorded
 
-    segments = spec.episode_length // config.tutor.period
     streams, recorded = jax.lax.scan(segment, streams, jax.random.split(scan_key, segments))
     return streams, jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), recorded)
 
@@ -158,7 +158,7 @@ def start(
         env=env_state,
         clock=nothing,
         practice=jnp.where(jax.random.uniform(practice_key, (n,)) < practice, _ANY, -1),
-        region=nothing,
+        region=nothing - 1,  # none yet
         goal_region=nothing,
         target=nothing,
         box=Box(lower=jnp.zeros_like(abstract), upper=jnp.zeros_like(abstract)),
@@ -210,7 +210,7 @@ def command(
 ) -> Streams:
     """The Commander's decision, for the streams whose clock is 0."""
     obs = streams.env.obs
-    locate = jax.vmap(partial(regions.locate, state.abstraction))
+    locate = partial(regions.locate, state.abstraction)
     aim = spec.goal_point(obs)
     region, goal_region = locate(spec.abstract(obs)), locate(aim)
     target, practice, lesson, past = goal_region, streams.practice, streams.lesson, streams.past
@@ -220,8 +220,8 @@ def command(
         practice = jnp.where((practice == region) | (practice == _ANY), another, practice)
         worth = None
         if past is not None:
-            past = _left(past, streams, region)
-            worth = config.commander.retry ** _tries(past, region, regions=state.abstraction.capacity)
+            past, tries = _remembered(streams, region, regions=state.abstraction.capacity)
+            worth = config.commander.retry**tries
         target = commander.act(
             state.commander,
             allowed,
@@ -264,25 +264,18 @@ def command(
     return _select(streams.clock == 0, fresh, streams)
 
 
-def remembering(config: AgentConfig, spec: Spec, abstraction: Abstraction, streams: Streams) -> Streams:
-    """Fresh `streams` of a greedy episode, with an empty memory of the Commander's decisions."""
-    if not config.commander.enabled:
-        return streams
-    here = jax.vmap(partial(regions.locate, abstraction))(spec.abstract(streams.env.obs))
-    decisions = spec.episode_length // config.tutor.period
-    return streams.replace(region=here, past=jnp.full((len(here), decisions, 2), -1))
+def _remembered(
+    streams: Streams, region: Int[Array, "B"], *, regions: int
+) -> tuple[Int[Array, "B N 2"], Float[Array, "B R"]]:
+    """`streams.past` by now, and how often `region` was left under each of the commands.
 
-
-def _left(past: Int[Array, "B N 2"], streams: Streams, region: Int[Array, "B"]) -> Int[Array, "B N 2"]:
-    """`past` and the last decision, where the agent is in another `region` by now."""
+    All in vain, as the agent is there again. The last decision is past where the agent is in another region.
+    """
+    assert streams.past is not None
     last = jnp.stack([streams.region, streams.target], axis=-1)
-    return where(region != streams.region, jnp.concatenate([past[:, 1:], last[:, None]], axis=1), past)
-
-
-def _tries(past: Int[Array, "B N 2"], region: Int[Array, "B"], *, regions: int) -> Float[Array, "B R"]:
-    """How often `region` was left under each of the commands: all in vain, as the agent is there again."""
+    past = where(region != streams.region, jnp.concatenate([streams.past[:, 1:], last[:, None]], axis=1), streams.past)
     again = (past[..., 0] == region[:, None]).astype(jnp.float32)
-    return jax.vmap(lambda target, weight: jnp.zeros(regions).at[target].add(weight))(past[..., 1], again)
+    return past, jax.vmap(lambda target, weight: jnp.zeros(regions).at[target].add(weight))(past[..., 1], again)
 
 
 def target_box(
@@ -378,7 +371,7 @@ def ahead_of_time(config: AgentConfig, spec: Spec, abstraction: Abstraction, str
     """
     if not config.commander.arrival:
         return streams
-    region = jax.vmap(partial(regions.locate, abstraction))(spec.abstract(streams.env.obs))
+    region = regions.locate(abstraction, spec.abstract(streams.env.obs))
     arrived = (region == streams.target) & (streams.target != streams.goal_region)
     return streams.replace(clock=jnp.where(arrived, 0, streams.clock))
 

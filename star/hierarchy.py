@@ -353,7 +353,7 @@ def _command_in_parts(
     outcome: Outcome,
 ) -> CommanderState:
     """The Commander in today's regions, after an epoch with those of `before` and the model `known` at its start."""
-    find = jax.vmap(partial(regions.locate, state.abstraction))
+    find = partial(regions.locate, state.abstraction)
     goal_region = find(decision.goal)
     cells = decision.replace(
         region=find(outcome.start),
@@ -455,7 +455,7 @@ def finished_period(
         goal_region=streams.goal_region,
         target=streams.target,
         reward=streams.reward,
-        next_region=jax.vmap(partial(regions.locate, state.abstraction))(end),
+        next_region=regions.locate(state.abstraction, end),
         weight=weight,
         lost=lost,
         practised=(streams.practice >= 0).astype(weight.dtype),

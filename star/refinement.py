@@ -96,7 +96,7 @@ def tell(
 ) -> Graph:
     """Take in the ways that teachers go, given as points close to one another; those of weight 0 count for nothing."""
     weight = jnp.broadcast_to(weight, paths.shape[:1])
-    region = jax.vmap(jax.vmap(partial(regions.locate, abstraction)))(paths)
+    region = regions.locate(abstraction, paths)
     order = jnp.cumsum(jnp.diff(region, axis=1, prepend=region[:, :1]) != 0, axis=1)  # counts the regions entered
     later = order[:, None, :] - order[:, :, None]
     inside = jax.nn.one_hot(region, abstraction.capacity)

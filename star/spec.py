@@ -97,14 +97,13 @@ class Spec:
         quaternion = state[..., np.asarray(self.orientation)]
         facing = yaw(quaternion)
         w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
-        cos, sin = jnp.cos(facing / 2), jnp.sin(facing / 2)
-        tilt = jnp.stack([cos * w + sin * z, cos * x + sin * y, cos * y - sin * x, cos * z - sin * w], axis=-1)
+        c, s = jnp.cos(facing / 2), jnp.sin(facing / 2)
+        tilt = jnp.stack([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w], axis=-1)
         tilt = jnp.where(tilt[..., :1] < 0, -tilt, tilt)
+        cos, sin = jnp.cos(facing), jnp.sin(facing)
 
         def turn(way: Array) -> Array:
-            cos, sin = jnp.cos(facing), jnp.sin(facing)
-            ahead, left = cos * way[..., 0] + sin * way[..., 1], cos * way[..., 1] - sin * way[..., 0]
-            return jnp.stack([ahead, left], axis=-1)
+            return jnp.stack([cos * way[..., 0] + sin * way[..., 1], cos * way[..., 1] - sin * way[..., 0]], axis=-1)
 
         velocity = np.asarray(self.velocity)
         state = state.at[..., velocity].set(turn(state[..., velocity]))

@@ -327,14 +327,14 @@ def test_who_comes_back_to_a_region_makes_less_of_what_it_was_told_there(breakin
         )
 
     streams = episode.start(spec, breaking_env, key=jax.random.key(2))
-    streams, told = episode.remembering(agent, spec, state.abstraction, streams), jax.jit(told)
+    streams, told = streams.replace(past=jnp.full((B, 40, 2), -1)), jax.jit(told)
     goal = [slow_locate(state.abstraction, point) for point in np.asarray(spec.goal_point(streams.env.obs))]
     tried, before, changed = np.zeros((B, n, n)), np.asarray(streams.region), 0
     target = np.zeros(B, int)
     for now in route:
         streams = told(streams, now)
         for b in range(B):
-            if now[b] != before[b]:
+            if now[b] != before[b] >= 0:
                 tried[b, before[b], target[b]] += 1
             values = q[now[b], goal[b], :n]
             known = values - (1 - retry ** tried[b, now[b]]) * np.abs(values)

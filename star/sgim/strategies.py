@@ -76,7 +76,7 @@ def assign(
     if config.goals:
         choice = jax.vmap(lambda key: selection.select(config.selection, state, present, key=key))(keys)
     else:
-        region = _locate(state.abstraction, goal)
+        region = regions.locate(state.abstraction, goal)
         only = jax.nn.one_hot(region, state.abstraction.capacity, dtype=bool)
         draw = partial(selection.select, config.selection, state, present)
         choice = jax.vmap(lambda only, key: draw(only, key=key))(only, keys).replace(goal=goal)
@@ -265,7 +265,7 @@ def _prepare(
             goal = jnp.where(mine[:, None], shown, goal)
     first = jnp.where(guided & taught, 0, length)
     return Lesson(
-        choice=choice.replace(goal=goal, region=_locate(state.abstraction, goal)),
+        choice=choice.replace(goal=goal, region=regions.locate(state.abstraction, goal)),
         taught=taught,
         waypoints=waypoints,
         first=first,
@@ -296,7 +296,3 @@ def _budgets(config: SgimConfig) -> Float[Array, "S"]:
     return jnp.asarray(
         [jnp.inf] * len(config.strategies) + [teacher.max_queries or jnp.inf for teacher in config.teachers]
     )
-
-
-def _locate(abstraction: Abstraction, points: Float[Array, "N d"]) -> Int[Array, "N"]:
-    return jax.vmap(partial(regions.locate, abstraction))(points)
