@@ -10,8 +10,7 @@ The B environments are B streams of one table: the errors of a cell are averaged
 visited it, and alpha_n = 1 - (1 - alpha)^n is the step that n updates in a row towards that average would make.
 
 Planning (`model`): where the command of a region leads does not depend on the goal, so decisions teach about all other
-goals. Counts of (i, j) -> i' and mean rewards make a model of the regions, on which value iteration runs at every
-instant:
+goals. Counts of (i, j) -> i' and mean rewards make a model of the regions, on which value iteration runs once a period:
 
     Q[i, g, j] <- r[i, g, j] + gamma sum_i' P(i' | i, j) max_j' Q[i', g, j']
 
@@ -267,10 +266,10 @@ def settle(
     """The Commander for greedy episodes of so many `periods`, with Q by what commands have led to.
 
     The belief that what was not tried succeeds makes agents try it, which is of no use where nothing is learnt: here it
-    only decides among what is unknown. And since regions were cut and judged after the last plan, this one begins from
-    nothing. Of commands that look about as good the usual one is better known: regions are coarse, and what leads on
-    where agents stood when they tried it may lead nowhere from where they enter. So what was chosen less often is
-    worth a little less. Q stays as it is without a model, and with rewards by distance, of which nothing is the best.
+    only decides among what is unknown, and none of it is left over, as this plan begins from nothing. Of commands that
+    look about as good the usual one is better known: regions are coarse, and what leads on where agents stood when they
+    tried it may lead nowhere from where they enter. So what was chosen less often is worth a little less. Q stays as it
+    is without a model, and with rewards by distance, of which nothing is the best.
     """
     if state.model is None or config.reward != "success":
         return state

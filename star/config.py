@@ -105,7 +105,7 @@ class PPOConfig(Section):
     """Proximal policy optimisation (Schulman et al. 2017) with an adaptive learning rate."""
 
     hidden: Hidden = Field((256, 256, 128), description="widths of the actor's and critic's layers")
-    learning_rate: float = Field(5e-4, gt=0, description="initial Adam step size")
+    learning_rate: float = Field(5e-4, gt=0, description="initial Adam step size; adaptive, never below 1e-5")
     max_learning_rate: float = Field(1e-3, gt=0, description="ceiling of the adaptive step size")
     target_kl: float = Field(0.016, gt=0, description="KL divergence per pass that the step size aims at")
     discount: float = Field(0.95, ge=0, le=1, description="gamma per decision of the level")
@@ -470,7 +470,7 @@ class TrainerConfig(Section):
     )
     eval_every: Positive = Field(2, description="epochs between evaluations")
     eval_episodes: Batch = Field(100, description="episodes of each evaluation, per seed")
-    checkpoint_every: Positive = Field(5, description="epochs between checkpoints")
+    checkpoint_every: Positive = Field(4, description="epochs between checkpoints")
     keep_checkpoints: Positive = Field(3, description="latest checkpoints kept, besides the best")
     on_non_finite: Literal["stop", "rollback"] = Field(
         "stop",

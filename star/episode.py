@@ -194,7 +194,7 @@ def settled(config: AgentConfig, state: TrainState, *, episode_length: int) -> C
         state.commander,
         successors(config, state),
         believed=believed(config, state),
-        periods=episode_length // config.commander.period,
+        periods=max(1, episode_length // config.commander.period),
     )
 
 
@@ -238,17 +238,10 @@ def command(
             target = jnp.where(there & (practice < 0), goal_region, target)
     to_point = jnp.zeros_like(practice, bool)
     if config.commander.enabled and lesson is not None:
-        lesson, waypoint, to_point = strategies.impose(config.sgim, lesson, spec.abstract(obs))
-        if config.sgim.shows_subgoals:  # on a teacher's route the regions that the Commander will have to choose
-            corners = (corner[region] for corner in (state.abstraction.lower, state.abstraction.upper))
-            beyond, led = strategies.onward(lesson, spec.abstract(obs), *corners)
-            led &= strategies.guided(config.sgim, lesson)
-            target, to_point = jnp.where(led, locate(beyond), target), to_point & ~led
-        target, aim = jnp.where(to_point, locate(waypoint), target), jnp.where(to_point[:, None], waypoint, aim)
+        lesson, target, waypoint, to_point = _led(config, spec, state.abstraction, lesson, obs, region, target)
+        aim = jnp.where(to_point[:, None], waypoint, aim)
     around_point = to_point | ((target == goal_region) & (practice < 0))
-    fresh = Streams(
-        env=streams.env,
-        clock=streams.clock,
+    fresh = streams.replace(
         practice=practice,
         region=region,
         goal_region=goal_region,
@@ -257,11 +250,30 @@ def command(
         start=spec.abstract(obs),
         reward=jnp.full_like(streams.reward, commander.start_reward(config.commander)),
         waypoint=to_point,
-        episode=streams.episode,
         lesson=lesson,
         past=past,
     )
     return _select(streams.clock == 0, fresh, streams)
+
+
+def _led(
+    config: AgentConfig,
+    spec: Spec,
+    abstraction: Abstraction,
+    lesson: Lesson,
+    obs: Float[Array, "B obs"],
+    region: Int[Array, "B"],
+    target: Int[Array, "B"],
+) -> tuple[Lesson, Int[Array, "B"], Float[Array, "B d"], Bool[Array, "B"]]:
+    """The lesson by now, the targets under it, its waypoints, and where the Tutor is given these, not a region."""
+    locate = partial(regions.locate, abstraction)
+    lesson, waypoint, to_point = strategies.impose(config.sgim, lesson, spec.abstract(obs))
+    if config.sgim.shows_subgoals:  # on a teacher's route the regions that the Commander will have to choose
+        corners = (corner[region] for corner in (abstraction.lower, abstraction.upper))
+        beyond, led = strategies.onward(lesson, spec.abstract(obs), *corners)
+        led &= strategies.guided(config.sgim, lesson)
+        target, to_point = jnp.where(led, locate(beyond), target), to_point & ~led
+    return lesson, jnp.where(to_point, locate(waypoint), target), waypoint, to_point
 
 
 def _remembered(
@@ -287,10 +299,9 @@ def target_box(
     point: Float[Array, "B d"],
 ) -> Box:
     """Bounds that the Tutor is given: those of the target region, or point +- margin (of g*, or a waypoint)."""
-    margin = config.commander.goal_margin
+    whole = Box(lower=abstraction.lower[target], upper=abstraction.upper[target])
     around = around_point[:, None] & spec.in_goal()
-    lower, upper = abstraction.lower[target], abstraction.upper[target]
-    return Box(lower=jnp.where(around, point - margin, lower), upper=jnp.where(around, point + margin, upper))
+    return where(around, Box.around(point, config.commander.goal_margin), whole)
 
 
 def choose_subgoal(
@@ -300,7 +311,7 @@ def choose_subgoal(
     obs = streams.env.obs
     position = spec.abstract(obs)
     if state.tutor is None:
-        return jnp.concatenate([streams.box.lower - position, streams.box.upper - position], axis=-1), None
+        return streams.box.seen_from(position).corners, None
     seen = tutor.observe(config.tutor, spec.state(obs), position, streams.box)
     action = learner.act(config.tutor, state.tutor, seen, deterministic=deterministic, key=key)
     if streams.lesson is not None and config.sgim.shows_subgoals:

@@ -40,7 +40,7 @@ def summarise(episode: Episode) -> dict[str, Any]:
     """Statistics of the episodes of one seed (arrays [E]).
 
     `success_any` and `success_final` come with Wilson score intervals, `distance` (units of the state, at the end of
-    the episode) and `return` (sum of -||g* - s||) with Student's t intervals. Keys ending in `_interval` hold
+    the episode) and `return` (sum of the task's rewards) with Student's t intervals. Keys ending in `_interval` hold
     [low, high] at 95 %.
     """
     any_, final, distance, total = (

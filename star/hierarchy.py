@@ -40,7 +40,7 @@ from star.sgim.strategies import Lesson
 from star.sgim.teachers import Demonstrations
 from star.spec import Spec
 from star.state import TrainState
-from star.tutor import Trace
+from star.tutor import Box, Trace
 
 Metrics = dict[str, Array]
 
@@ -138,9 +138,7 @@ def _imitation(
         position = spec.abstract(drawn.state)
         subgoal = spec.pose(drawn.later) - spec.pose(drawn.state)
         if not config.tutor.enabled:
-            margin = config.commander.goal_margin
-            corners = drawn.outcome - margin, drawn.outcome + margin
-            subgoal = jnp.concatenate([corner - position for corner in corners], axis=-1)
+            subgoal = Box.around(drawn.outcome - position, config.commander.goal_margin).corners
         share = strategies.mimicking(config.sgim, lesson, number)
         batches.append(
             Imitation(
@@ -391,10 +389,9 @@ def _in_hindsight(config: AgentConfig, spec: Spec, batch: Transition, key: Array
     """Half of the replayed transitions as if what the agent reached had been its subgoal (Andrychowicz et al. 2017)."""
     p = len(spec.scale)
     size = p if config.tutor.enabled else 2 * p
-    margin = config.commander.goal_margin
     reached = batch.extras
     if size != p:
-        reached = jnp.concatenate([reached - margin, reached + margin], axis=-1)
+        reached = Box.around(reached, config.commander.goal_margin).corners
     before, after = reached[:, 0], reached[:, 1]
     price = config.controller.termination_penalty * batch.terminated
     replaced = jax.random.bernoulli(key, 0.5, batch.reward.shape)
@@ -444,8 +441,9 @@ def finished_period(
     """The Commander's decisions that came to their end with this segment; weight 0 elsewhere."""
     end = spec.abstract(steps.next_obs[-1])
     lesson = streams.lesson
-    whole_segment = steps.alive[-1] * (1 - steps.ended[-1])
     lost = jnp.max(steps.terminated * steps.alive, axis=0)
+    early = jnp.maximum(steps.ended[-1], lost)  # what is lost in the last step of an episode has not `ended` early
+    whole_segment = steps.alive[-1] * (1 - early)
     if lesson is not None:  # random subgoals tell nothing of where commands lead
         mine = ~strategies.babbles(config.sgim, lesson)
         whole_segment, lost = whole_segment * mine, lost * mine

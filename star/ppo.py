@@ -221,6 +221,7 @@ def _loss(
     share, advantage = batch.weight, batch.advantage
     mean, std = _policy(config, params, batch.obs)
     log_ratio = _log_prob(mean, std, batch.action) - batch.log_prob
+    log_ratio = jnp.where(share > 0, log_ratio, 0.0)  # others' actions may be infinitely unlikely, and 0 * inf is NaN
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
     price = 0.0 if penalty is None or batch.transition is None else penalty(batch.transition, mean)

@@ -1,7 +1,7 @@
 """Refinement: between episodes, look at pairs of regions and cut a region where only a part of it reaches the other.
 
     a pair (i, j), i != j, is due when
-        it was commanded `min_transitions` times since i or j last changed,
+        it was commanded `min_transitions` times since i or j changed or it was examined (for (i, i) half of them stay),
         it has no verdict, and
         the forward model's held-out error on it has stopped falling
     the due pair with most transitions times epochs since it was examined is taken (star/reachability.py):
@@ -236,10 +236,7 @@ def refine(
 
     def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
         abstraction, graph = carry
-        waiting = due(config, graph, abstraction.active)
-        urgency = graph.transitions * (1 + graph.age) * weight
-        region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, urgency, -1.0)), waiting.shape)
-        found = waiting[region, target]
+        region, target, found = _most_urgent(config, abstraction, graph, weight)
         inside = region == target
         goal_key, cut_key = jax.random.split(pair_key)
         commanded, wanted, there = _boxes(abstraction, region, target, goals, radius=radius, key=goal_key)
@@ -277,6 +274,16 @@ def refine(
         "table_full": (abstraction.count == abstraction.capacity).astype(jnp.int32),
     }
     return abstraction, graph, splits, metrics
+
+
+def _most_urgent(
+    config: AgentConfig, abstraction: Abstraction, graph: Graph, weight: Float[Array, "R"] | float
+) -> tuple[Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
+    """The pair to examine next, region and target, and whether any is due."""
+    waiting = due(config, graph, abstraction.active)
+    urgency = graph.transitions * (1 + graph.age) * weight
+    region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, urgency, -1.0)), waiting.shape)
+    return region, target, waiting[region, target]
 
 
 def on_split(graph: Graph, split: Split) -> Graph:

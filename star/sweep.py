@@ -2,7 +2,7 @@
 
     work(sweep, ledger):
         take trials; those of one structure begin together, each in a slot of one program
-        repeat an epoch of all slots                          # star/trainer.py: SideBySide
+        repeat an epoch of all slots                          # star/side_by_side.py
             report evaluations; end trials that are finished, pruned or broken
             a slot that is free takes the next trial of its structure
         until the study has all its trials

@@ -27,10 +27,24 @@ class Box(struct.PyTreeNode):
     lower: Float[Array, "*batch d"]
     upper: Float[Array, "*batch d"]
 
+    @classmethod
+    def around(cls, point: Float[Array, "*batch d"], margin: float | Array) -> Box:
+        """The box of half-width `margin` with `point` at its centre."""
+        return cls(lower=point - margin, upper=point + margin)
+
     @property
     def centre(self) -> Float[Array, "*batch d"]:
         """The point that the Tutor is rewarded for approaching."""
         return (self.lower + self.upper) / 2
+
+    @property
+    def corners(self) -> Float[Array, "*batch 2*d"]:
+        """Both corners as one vector, as the Controller sees them where there is no Tutor."""
+        return jnp.concatenate([self.lower, self.upper], axis=-1)
+
+    def seen_from(self, origin: Float[Array, "*batch d"]) -> Box:
+        """The box relative to `origin`."""
+        return Box(lower=self.lower - origin, upper=self.upper - origin)
 
 
 class Trace(struct.PyTreeNode):
@@ -46,7 +60,7 @@ def observe(
 ) -> Float[Array, "*batch state+2*d"]:
     """The state with the bounds of the target box, relative to `abstract`, its abstract part, or as they are."""
     origin = abstract if config.relative_bounds else jnp.zeros_like(abstract)
-    return jnp.concatenate([state, box.lower - origin, box.upper - origin], axis=-1)
+    return jnp.concatenate([state, box.seen_from(origin).corners], axis=-1)
 
 
 def subgoal(action: Float[Array, "*batch p"], scale: Float[Array, "p"]) -> Float[Array, "*batch p"]:

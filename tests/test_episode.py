@@ -307,6 +307,14 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
     assert (0 < early < 7 * B) == arrival
 
 
+def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
+    agent = loading.parse(tiny).agent()
+    state = star.state.init(agent, Spec.of(breaking_env.env), key=jax.random.key(0))
+    short, one = (episode.settled(agent, state, episode_length=steps).q for steps in (K - L, K))
+    assert np.asarray(one).any()
+    np.testing.assert_array_equal(short, one)
+
+
 @pytest.mark.parametrize("retry", [0.9, 0.5, 1.0])
 def test_who_comes_back_to_a_region_makes_less_of_what_it_was_told_there(breaking_env, tiny, retry):
     agent = loading.parse(tiny, {"commander.retry": retry, "commander.hold": False}).agent()

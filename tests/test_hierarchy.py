@@ -1,5 +1,7 @@
 """What each level learns from, against loops written from the equations, and the epoch as one pure, jitted function."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,6 +46,23 @@ def test_a_period_is_lost_where_the_task_was_terminated_and_not_where_it_was_tru
         assert recording.decision.lost[i, b] == expected
         lost += expected
     assert 0 < lost < sum(ended(recording, i, b) for i, b in segments(recording))
+
+
+def test_a_period_lost_in_the_last_step_of_an_episode_is_not_counted_as_finished_too(recording):
+    # time is up there, so `ended`, which is for ends before it, is 0 though the task terminated
+    fatal = [
+        i for i, b in segments(recording) if recording.steps.terminated[i, -1, b] * recording.steps.alive[i, -1, b]
+    ]
+    lost = 0
+    for i in fatal:
+        advanced, steps = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (recording.advanced, recording.steps))
+        steps = steps.replace(ended=np.zeros_like(steps.ended))
+        state = SimpleNamespace(abstraction=recording.abstraction)
+        decision, outcome = hierarchy.finished_period(recording.config.agent(), recording.spec, state, advanced, steps)
+        last = steps.terminated[-1] * steps.alive[-1] > 0
+        assert (decision.lost[last] == 1).all() and not decision.weight[last].any() and not outcome.weight[last].any()
+        lost += (last & (advanced.clock == 0)).sum()
+    assert lost > 0
 
 
 def test_a_finished_period_tells_where_it_began_what_it_aimed_at_and_where_it_ended(recording):

@@ -102,6 +102,17 @@ def test_samples_of_weight_0_have_no_influence(start, update):
     assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (first.params, start.params)), strict=True))
 
 
+def test_what_has_weight_0_may_become_infinitely_unlikely(start, update):
+    rollout = random_rollout()
+    weight = np.ones((T, B), np.float32)
+    weight[0, :2] = 0
+    action = rollout.action.copy()
+    action[0, :2] = np.float32([[1e6, 1e6], [-1e6, -1e6]])  # what somebody else did; one of them gains by any step
+    given = rollout.replace(action=action, weight=weight)
+    state, metrics = update(settings(), start, given, jax.random.key(1))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state, metrics)))
+
+
 def test_the_step_size_shrinks_after_large_changes_of_the_policy_and_grows_after_small_ones(start, update):
     rollout = random_rollout()
     for target, factor in ((1e-12, 1 / 1.5), (1e3, 1.5)):

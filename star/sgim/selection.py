@@ -172,8 +172,8 @@ def select(
     shares = jnp.stack([config.random, jnp.maximum(1 - config.random - config.best, 0.0), config.best])
     mode = jax.random.categorical(mode_key, jnp.log(shares))
     at_random, by_interest = _distributions(config, state, available, admissible)
-    where, how = jax.tree.map(lambda a, b: jnp.where(mode == RANDOM, a, b), at_random, by_interest)
-    region = jax.random.categorical(region_key, jnp.log(where))
+    regional, how = jax.tree.map(lambda a, b: jnp.where(mode == RANDOM, a, b), at_random, by_interest)
+    region = jax.random.categorical(region_key, jnp.log(regional))
     strategy = jax.random.categorical(strategy_key, jnp.log(how[region]))
     return Choice(
         region=region,
@@ -299,7 +299,7 @@ def _sharpened(config: SelectionConfig, worth: Float[Array, "*n K"]) -> Float[Ar
 def _mixture(
     config: SelectionConfig, at_random: tuple[Array, Array], by_interest: tuple[Array, Array]
 ) -> Float[Array, "R S"]:
-    joint = [where[:, None] * how for where, how in (at_random, by_interest)]
+    joint = [regional[:, None] * how for regional, how in (at_random, by_interest)]
     return config.random * joint[0] + (1 - config.random) * joint[1]
 
 
