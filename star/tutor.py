@@ -38,7 +38,7 @@ class Box(struct.PyTreeNode):
         return (self.lower + self.upper) / 2
 
     @property
-    def corners(self) -> Float[Array, "*batch 2*d"]:
+    def corners(self) -> Float[Array, "*batch m"]:
         """Both corners as one vector, as the Controller sees them where there is no Tutor."""
         return jnp.concatenate([self.lower, self.upper], axis=-1)
 

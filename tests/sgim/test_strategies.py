@@ -579,7 +579,7 @@ def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, 
     assert babbling.any() and detour.any() and not (babbling | detour).all()
 
     @jax.jit
-    def finished(key):
+    def finished(key, terminated):
         state = star.state.init(agent, spec, key=key)
         streams = episode.start(spec, breaking_env, key=key).replace(lesson=lesson)
         allowed = episode.successors(agent, state)
@@ -589,12 +589,12 @@ def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, 
             agent, spec, breaking_env, state, streams, subgoal, deterministic=False, key=key
         )
         ones = jnp.ones_like(steps.alive)
-        steps = steps.replace(alive=ones, ended=0 * ones, terminated=ones)
+        steps = steps.replace(alive=ones, ended=0 * ones, terminated=terminated * ones)
         return hierarchy.finished_period(agent, spec, state, streams.replace(clock=0 * streams.clock), steps)
 
-    decision, outcome = finished(jax.random.key(0))
+    decision, outcome = finished(jax.random.key(0), 0.0)
     np.testing.assert_array_equal(decision.aside, detour)
-    for told in (decision.weight, decision.lost, outcome.weight):
+    for told in (decision.weight, finished(jax.random.key(0), 1.0)[0].lost, outcome.weight):
         np.testing.assert_array_equal(np.asarray(told) > 0, ~babbling)
 
 
