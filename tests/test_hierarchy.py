@@ -50,11 +50,9 @@ def test_a_period_is_lost_where_the_task_was_terminated_and_not_where_it_was_tru
 
 def test_a_period_lost_in_the_last_step_of_an_episode_is_not_counted_as_finished_too(recording):
     # time is up there, so `ended`, which is for ends before it, is 0 though the task terminated
-    fatal = [
-        i for i, b in segments(recording) if recording.steps.terminated[i, -1, b] * recording.steps.alive[i, -1, b]
-    ]
+    fatal = (recording.steps.terminated * recording.steps.alive)[:, -1].any(axis=1)
     lost = 0
-    for i in fatal:
+    for i in np.flatnonzero(fatal):
         advanced, steps = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (recording.advanced, recording.steps))
         steps = steps.replace(ended=np.zeros_like(steps.ended))
         state = SimpleNamespace(abstraction=recording.abstraction)
