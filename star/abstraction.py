@@ -121,6 +121,12 @@ def split(abstraction: Abstraction, cut: Cut, *, min_width: float | Array) -> tu
     )
 
 
+def coarse(abstraction: Abstraction, share: float | Array) -> Bool[Array, "R"]:
+    """Which regions are at least `share` times as large as each of R equal ones would be, R being the capacity."""
+    widths, space = abstraction.upper - abstraction.lower, abstraction.space[1] - abstraction.space[0]
+    return jnp.prod(widths / space, axis=-1) * abstraction.capacity >= share
+
+
 def adjacent(abstraction: Abstraction) -> Bool[Array, "R R"]:
     """Which active regions share a face; none is its own neighbour."""
     lower = jnp.maximum(abstraction.lower[:, None], abstraction.lower[None])

@@ -288,6 +288,9 @@ class AbstractionConfig(Section):
         None, description="instead of cuts: equal initial parts along each abstract dimension, 1 where left out"
     )
     min_width: float = Field(1.0, gt=0, description="no region is cut narrower than this (units of the state)")
+    min_share: float = Field(
+        0.0, ge=0, description="no region is cut that is smaller than this times the space over max_regions; 0: any"
+    )
 
 
 class ForwardModelConfig(BufferedConfig):

@@ -374,7 +374,8 @@ def _cut(
     def one_cut(carry: tuple, cut_key: Array) -> tuple[tuple, Split]:
         abstraction, graph, parts = carry
         min_width = config.abstraction.min_width
-        cut, gain = best_cut(abstraction, parts, leaves, min_width=min_width)
+        candidates = parts & regions.coarse(abstraction, config.abstraction.min_share)
+        cut, gain = best_cut(abstraction, candidates, leaves, min_width=min_width)
         if config.refinement.cuts == "random":
             cut = random_cut(abstraction, cut.region, min_width=min_width, key=cut_key)
         child = abstraction.count

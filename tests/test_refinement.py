@@ -348,6 +348,15 @@ def test_no_region_is_cut_narrower_than_min_width(refine, moving):
         assert int(abstraction.count) == count
 
 
+def test_no_region_is_cut_that_is_smaller_than_its_share_of_the_table(refine, moving):
+    # A quarter of the space is 1.5 times what each of six equal regions would be.
+    for share, count in ((1.6, 4), (1.4, 5)):
+        chosen = settings(**{"abstraction.min_share": share})
+        abstraction, _, _, metrics = refine(chosen, grid(), knowing((0, 2)), moving((6, 0)))
+        assert int(metrics["mixed"]) == 1
+        assert int(abstraction.count) == count
+
+
 @pytest.mark.parametrize(("target", "by"), [(2, (6, 0)), (3, (6, 6))])
 @pytest.mark.parametrize(("everywhere", "verdict"), [(False, REACHES), (True, UNKNOWN)])
 def test_where_no_cut_is_made_there_is_an_edge_if_all_parts_that_agents_visit_reach(
