@@ -198,7 +198,8 @@ def alp_gmm(
     def select(state: Any, *, key: Array) -> tuple[Array, Array]:
         *_, mixture, n = state
         random_key, even_key, part_key, goal_key, strategy_key = jax.random.split(key, 5)
-        part = jax.random.categorical(part_key, jnp.log(mixture.weights > 0) + jnp.log(mixture.means[:, -1]))
+        mean_progress = jnp.maximum(mixture.means[:, -1], 0.0)  # 0 may be less than 0 by rounding
+        part = jax.random.categorical(part_key, jnp.log(mean_progress * (mixture.weights > 0)))
         mean, covariance = mixture.means[part, :d], mixture.covariances[part, :d, :d]
         drawn = jax.random.multivariate_normal(goal_key, mean, covariance)
         even = jax.random.uniform(even_key, (d,), minval=low, maxval=high)
