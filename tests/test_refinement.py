@@ -340,21 +340,18 @@ def test_a_full_table_is_reported_and_stays_as_it_is(refine, moving):
     jax.tree.map(np.testing.assert_array_equal, full, abstraction)
 
 
-def test_no_region_is_cut_narrower_than_min_width(refine, moving):
-    for width, count in ((6.5, 4), (5.5, 5)):
-        chosen = settings(**{"abstraction.min_width": width})
-        abstraction, _, _, metrics = refine(chosen, grid(), knowing((0, 2)), moving((6, 0)))
-        assert int(metrics["mixed"]) == 1
-        assert int(abstraction.count) == count
-
-
-def test_no_region_is_cut_that_is_smaller_than_its_share_of_the_table(refine, moving):
+@pytest.mark.parametrize(
+    ("limit", "value", "count"),
     # A quarter of the space is 1.5 times what each of six equal regions would be.
-    for share, count in ((1.6, 4), (1.4, 5)):
-        chosen = settings(**{"abstraction.min_share": share})
-        abstraction, _, _, metrics = refine(chosen, grid(), knowing((0, 2)), moving((6, 0)))
-        assert int(metrics["mixed"]) == 1
-        assert int(abstraction.count) == count
+    [("min_width", 6.5, 4), ("min_width", 5.5, 5), ("min_share", 1.6, 4), ("min_share", 1.4, 5)],
+)
+def test_no_region_is_cut_narrower_than_min_width_or_that_is_smaller_than_min_share(
+    refine, moving, limit, value, count
+):
+    chosen = settings(**{f"abstraction.{limit}": value})
+    abstraction, _, _, metrics = refine(chosen, grid(), knowing((0, 2)), moving((6, 0)))
+    assert int(metrics["mixed"]) == 1
+    assert int(abstraction.count) == count
 
 
 @pytest.mark.parametrize(("target", "by"), [(2, (6, 0)), (3, (6, 6))])
