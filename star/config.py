@@ -257,6 +257,9 @@ class ControllerConfig(LevelConfig):
     termination_penalty: float = Field(
         20.0, ge=0, description="taken off the reward where the task is terminated, as by a flip"
     )
+    tilt_penalty: float = Field(
+        0.0, ge=0, description="taken off the reward of every env step, times 1 - cos of the body's tilt after it"
+    )
     frame: Literal["world", "body"] = Field(
         "world", description="axes of velocity, tilt and subgoal as it sees them: the world's, or turned with the body"
     )

@@ -4,6 +4,7 @@
               z with the body, so that what was learnt in one direction holds in all
     g_{t+1} = s_t + g_t - s_{t+1}                           the subgoal stays where it is while the agent moves
     reward  = -||s_t + g_t - s_{t+1}||  (`distance`, published)   or   ||g_t|| - ||g_{t+1}||  (`progress`)
+              less a penalty for the tilt of the body, and one where the task is terminated
 
 Without a Tutor the subgoal is the target box itself, its lower and upper corner relative to s, [2d] numbers, and
 ||.|| is the distance to the box, as in GARA (Zadem, Mover and Nguyen 2023).
@@ -65,3 +66,11 @@ def reward(
     """Reward of one env step from the relative subgoals before and after it, of `size` = d coordinates or boxes."""
     before, after = distance(subgoal, size=size), distance(next_subgoal, size=size)
     return config.reward_scale * (-after if config.reward == "distance" else before - after)
+
+
+def price(
+    config: ControllerConfig, spec: Spec, next_obs: Float[Array, "*batch obs"], terminated: Float[Array, "*batch"]
+) -> Float[Array, "*batch"]:
+    """What is taken off the reward of an env step that led to `next_obs`, whatever the subgoal is."""
+    lost = config.termination_penalty * terminated
+    return lost + config.tilt_penalty * spec.tilt(next_obs) if spec.orientation else lost

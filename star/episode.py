@@ -63,11 +63,13 @@ class Episode(struct.PyTreeNode):
     success_final: Float[Array, "B"]
     distance: Float[Array, "B"]
     total: Float[Array, "B"]
+    flipped: Float[Array, "B"]
+    """1 where the body lies on its back, at the last step."""
 
     @classmethod
     def start(cls, num_envs: int) -> Episode:
         """Before the first step."""
-        return cls(*(jnp.zeros(num_envs) for _ in range(4)))
+        return cls(*(jnp.zeros(num_envs) for _ in range(5)))
 
 
 Record = Callable[[EnvState, Array, Box, Array], Any]
@@ -415,6 +417,7 @@ def _record(episode: Episode, env_state: EnvState, alive: Float[Array, "B"]) -> 
         success_final=jnp.where(alive > 0, success, episode.success_final),
         distance=jnp.where(alive > 0, distance, episode.distance),
         total=episode.total + env_state.reward * alive,
+        flipped=jnp.where(alive > 0, env_state.metrics["flipped"], episode.flipped),
     )
 
 

@@ -40,12 +40,13 @@ def summarise(episode: Episode) -> dict[str, Any]:
     """Statistics of the episodes of one seed (arrays [E]).
 
     `success_any` and `success_final` come with Wilson score intervals, `distance` (units of the state, at the end of
-    the episode) and `return` (sum of the task's rewards) with Student's t intervals. Keys ending in `_interval` hold
-    [low, high] at 95 %.
+    the episode) and `return` (sum of the task's rewards) with Student's t intervals. `flipped` is the share that ends
+    with the body on its back, `failed_flipped` the same of those that never reach the goal, None if all do. Keys ending
+    in `_interval` hold [low, high] at 95 %.
     """
-    any_, final, distance, total = (
+    any_, final, distance, total, flipped = (
         np.asarray(x, np.float64).ravel()
-        for x in (episode.success_any, episode.success_final, episode.distance, episode.total)
+        for x in (episode.success_any, episode.success_final, episode.distance, episode.total, episode.flipped)
     )
     return {
         "episodes": len(any_),
@@ -57,6 +58,8 @@ def summarise(episode: Episode) -> dict[str, Any]:
         "distance_interval": mean_interval(distance),
         "return": float(total.mean()),
         "return_interval": mean_interval(total),
+        "flipped": float(flipped.mean()),
+        "failed_flipped": float(flipped[any_ == 0].mean()) if (any_ == 0).any() else None,
     }
 
 
@@ -191,4 +194,4 @@ def add_to(table: list[dict[str, Any]], episodes: Episode, *, where: np.ndarray 
         if where is not None and not where[i]:
             continue
         summary = summarise(jax.tree.map(lambda x, i=i: x[i], host))
-        row |= {f"eval/{name}": summary[name] for name in ("success_any", "success_final", "distance", "return")}
+        row |= {f"eval/{name}": summary[name] for name in (*MEASURES, "distance", "return", "flipped")}

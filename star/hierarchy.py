@@ -366,11 +366,11 @@ def _command_in_parts(
 def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transition:
     observe = partial(controller.observe, config.controller, spec)
     last = jnp.zeros_like(steps.alive).at[-1].set(1.0)
+    reward = controller.reward(config.controller, steps.subgoal, steps.next_subgoal, size=len(spec.scale))
     return Transition(
         obs=observe(spec.state(steps.obs), steps.subgoal),
         action=steps.action,
-        reward=controller.reward(config.controller, steps.subgoal, steps.next_subgoal, size=len(spec.scale))
-        - config.controller.termination_penalty * steps.terminated,
+        reward=reward - controller.price(config.controller, spec, steps.next_obs, steps.terminated),
         next_obs=observe(spec.state(steps.next_obs), steps.next_subgoal),
         terminated=steps.terminated,
         cut=jnp.maximum(last, steps.ended),
@@ -393,13 +393,14 @@ def _in_hindsight(config: AgentConfig, spec: Spec, batch: Transition, key: Array
     if size != p:
         reached = Box.around(reached, config.commander.goal_margin).corners
     before, after = reached[:, 0], reached[:, 1]
-    price = config.controller.termination_penalty * batch.terminated
+    reward = partial(controller.reward, config.controller, size=p)
+    price = reward(batch.obs[:, -size:], batch.next_obs[:, -size:]) - batch.reward  # does not depend on the subgoal
     replaced = jax.random.bernoulli(key, 0.5, batch.reward.shape)
 
     relabelled = batch.replace(
         obs=batch.obs.at[:, -size:].set(before),
         next_obs=batch.next_obs.at[:, -size:].set(after),
-        reward=controller.reward(config.controller, before, after, size=p) - price,
+        reward=reward(before, after) - price,
     )
     return where(replaced, relabelled, batch)
 

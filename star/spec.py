@@ -87,6 +87,11 @@ class Spec:
         ahead = self.heading * jnp.stack([jnp.cos(facing), jnp.sin(facing)], axis=-1)
         return jnp.concatenate([self.abstract(obs), ahead], axis=-1)
 
+    def tilt(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch"]:
+        """1 - cos of the angle between the body's up axis and the world's: 0 upright, 1 on its side, 2 on its back."""
+        _, x, y, _ = jnp.moveaxis(obs[..., np.asarray(self.orientation)], -1, 0)
+        return 2.0 * (x**2 + y**2)
+
     def turned(
         self, state: Float[Array, "*batch state"], ways: Float[Array, "*batch m"]
     ) -> tuple[Float[Array, "*batch state"], Float[Array, "*batch m"]]:

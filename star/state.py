@@ -83,6 +83,10 @@ def check(config: Config, spec: Spec) -> None:
         raise ValueError(f"tutor.heading: {spec.heading:g}, but the body has no orientation; allowed: null")
     if config.controller.frame == "body" and not (spec.orientation and spec.velocity):
         raise ValueError("controller.frame: body, but the body has no orientation; allowed: world")
+    if config.controller.tilt_penalty and not spec.orientation:
+        raise ValueError(
+            f"controller.tilt_penalty: {config.controller.tilt_penalty:g}, but the body has no orientation; allowed: 0"
+        )
     cells = int(np.prod(adjacency.shape(config.tutor.adjacency, spec.space)))
     if config.tutor.adjacency.enabled and cells > adjacency.MAX_CELLS:
         raise ValueError(

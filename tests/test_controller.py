@@ -114,3 +114,18 @@ def test_a_body_that_faces_nowhere_has_no_axes_of_its_own():
     point = Spec.of(envs.make("point_maze"))
     with pytest.raises(ValueError, match="controller.frame: body, but the body has no orientation; allowed: world"):
         state.check(loading.parse({"controller": {"frame": "body"}}), point)
+    with pytest.raises(ValueError, match="controller.tilt_penalty: 2, but the body has no orientation; allowed: 0"):
+        state.check(loading.parse({"controller": {"tilt_penalty": 2.0}}), point)
+
+
+def test_tilt_costs_by_the_cosine_between_the_bodys_up_axis_and_the_worlds():
+    orientations = np.random.default_rng(2).normal(size=(50, 4))
+    orientations /= np.linalg.norm(orientations, axis=1, keepdims=True)
+    obs, expected = np.zeros((50, 14)), np.zeros(50)
+    obs[:, 3:7] = orientations
+    for n in range(50):
+        rotation = np.zeros(9)
+        mujoco.mju_quat2Mat(rotation, orientations[n])
+        expected[n] = 3 * (1 - rotation[8])
+    flat = settings(tilt_penalty=3.0, termination_penalty=0.0)
+    np.testing.assert_allclose(controller.price(flat, knowledge(), obs, np.ones(50)), expected, atol=1e-5)

@@ -183,10 +183,11 @@ def test_episode_statistics_are_those_of_the_steps_since_the_last_reset(recordin
                 obs = recording.steps.next_obs[i, t, b]
                 distance = np.linalg.norm(obs[:2] - obs[4:6])
                 any_[b], total[b] = max(any_[b], distance < 5), total[b] - distance
-                final = float(distance < 5)
+                final, flipped = float(distance < 5), recording.steps.terminated[i, t, b]
         seen = recording.advanced.episode
         assert seen.success_any[i, b] == any_[b]
         assert seen.success_final[i, b] == final
+        assert seen.flipped[i, b] == flipped
         np.testing.assert_allclose(seen.distance[i, b], distance, rtol=1e-5)
         np.testing.assert_allclose(seen.total[i, b], total[b], rtol=1e-4)
         if ended(recording, i, b):

@@ -17,7 +17,8 @@ OTHER = {"maze": [0.2, 0.4], "rooms": [0.7, 0.1, 0.9, 1.0], "fall": [0.5]}
 def trials(reached, steps, path):
     """Episodes that begin at the origin."""
     unused = np.zeros(len(reached))
-    ended = Episode(success_any=np.array(reached, float), success_final=unused, distance=unused, total=unused)
+    rest = dict.fromkeys(("success_final", "distance", "total", "flipped"), unused)
+    ended = Episode(success_any=np.array(reached, float), **rest)
     places = np.zeros((len(reached), 2))
     return Trials(episode=ended, steps=np.array(steps, float), path=np.array(path, float), start=places, goal=places)
 
@@ -94,3 +95,11 @@ def test_success_is_weighted_by_how_much_longer_than_the_shortest_the_way_was():
     reached, path = np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0]), np.array([10.0, 20.0, 10.0, 0.0, 9.0, 3.0])
     shortest = np.array([10.0, 10.0, 10.0, 0.0, 10.0, np.inf])
     np.testing.assert_allclose(evaluation.weighted_success(reached, path, shortest), [1.0, 0.5, 0.0, 1.0, 1.0])
+
+
+def test_the_share_of_failures_that_end_on_the_back_is_none_where_nothing_fails():
+    rest = dict.fromkeys(("success_final", "distance", "total"), np.zeros(4))
+    ended = Episode(success_any=np.array([1.0, 0.0, 0.0, 0.0]), flipped=np.array([1.0, 1.0, 0.0, 1.0]), **rest)
+    found = evaluation.summarise(ended)
+    assert found["flipped"] == 3 / 4 and found["failed_flipped"] == 2 / 3
+    assert evaluation.summarise(ended.replace(success_any=np.ones(4)))["failed_flipped"] is None

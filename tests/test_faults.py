@@ -199,7 +199,7 @@ def _initial(program):
 
 
 def _nothing(agent, state, keys):
-    return Episode(*(jnp.zeros((2, 3)) for _ in range(4)))
+    return Episode(*(jnp.zeros((2, 3)) for _ in range(5)))
 
 
 LOST = "controller/params/log_std"

@@ -328,32 +328,33 @@ def test_levels_can_be_left_out(breaking_env, turning, tiny, name):
 @pytest.mark.parametrize("tutored", [True, False])
 def test_hindsight_makes_what_was_reached_the_subgoal_of_half_of_the_batch(breaking_env, tiny, tutored):
     learner = {"controller.learner": "td3", "controller.hindsight": True, "tutor.enabled": tutored}
-    learner |= {"controller.termination_penalty": 3.0}
     agent, spec = loading.parse(tiny, learner).agent(), Spec.of(breaking_env.env)
     rng = np.random.default_rng(0)
     n, size = 400, 2 if tutored else 4
     reached = rng.normal(size=(n, 2, 2)).astype(np.float32)
+    price = rng.random(n) * (rng.random(n) < 0.3)
     batch = Transition(
         obs=jnp.full((n, 2 + size), 7.0),
         action=jnp.zeros((n, 2)),
-        reward=jnp.full(n, 7.0),
-        next_obs=jnp.full((n, 2 + size), 7.0),
+        reward=jnp.asarray(2 * np.sqrt(2) - price, jnp.float32),
+        next_obs=jnp.full((n, 2 + size), 5.0),
         terminated=jnp.asarray(rng.random(n) < 0.3, jnp.float32),
         cut=jnp.zeros(n),
         weight=jnp.ones(n),
         extras=jnp.asarray(reached),
     )
     got = hierarchy._in_hindsight(agent, spec, batch, jax.random.key(0))
-    changed = np.asarray(got.reward) != 7.0
+    changed = np.asarray(got.obs)[:, -1] != 7.0
     assert 0.4 < changed.mean() < 0.6
     np.testing.assert_array_equal(got.obs[:, :2], batch.obs[:, :2])
     around = 0.0 if tutored else agent.commander.goal_margin
-    for seen, place in ((got.obs, 0), (got.next_obs, 1)):
-        np.testing.assert_array_equal(np.asarray(seen)[~changed], 7.0)
+    np.testing.assert_array_equal(np.asarray(got.reward)[~changed], np.asarray(batch.reward)[~changed])
+    for seen, was, place in ((got.obs, 7.0, 0), (got.next_obs, 5.0, 1)):
+        np.testing.assert_array_equal(np.asarray(seen)[~changed], was)
         corners = [reached[changed, place] - around, reached[changed, place] + around][: size // 2]
         np.testing.assert_allclose(np.asarray(seen)[changed, 2:], np.concatenate(corners, axis=-1), atol=1e-6)
     distance = np.linalg.norm(np.maximum(np.abs(reached) - around, 0.0), axis=-1)
-    expected = distance[:, 0] - distance[:, 1] - 3.0 * np.asarray(batch.terminated)
+    expected = distance[:, 0] - distance[:, 1] - price
     np.testing.assert_allclose(np.asarray(got.reward)[changed], expected[changed], atol=1e-5)
 
 
