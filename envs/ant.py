@@ -24,7 +24,7 @@ import numpy as np
 
 from envs import scene
 from envs.arena import BLOCK, HEIGHT
-from envs.maze import yaw
+from envs.maze import uprightness, yaw
 from envs.physics import Physics, PhysicsState
 from envs.tasks import PRESETS, Switch, Task
 
@@ -137,7 +137,7 @@ class Ant:
 
     def flipped(self, data: PhysicsState) -> jax.Array:
         """Whether the torso's own up axis points down."""
-        return 1.0 - 2.0 * (data.qpos[4] ** 2 + data.qpos[5] ** 2) < ON_ITS_BACK
+        return uprightness(data.qpos[np.asarray(ORIENTATION)]) < ON_ITS_BACK
 
     def fallen(self, data: PhysicsState) -> jax.Array:
         """Whether the torso is below half the height of the floor."""

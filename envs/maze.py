@@ -247,6 +247,12 @@ def yaw(quaternion: jax.Array) -> jax.Array:
     return jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
 
 
+def uprightness(quaternion: jax.Array) -> jax.Array:
+    """Vertical part [...] of the up axis of unit quaternions [..., 4] (w, x, y, z): 1 upright, -1 on its back."""
+    _, x, y, _ = jnp.moveaxis(quaternion, -1, 0)
+    return 1.0 - 2.0 * (x**2 + y**2)
+
+
 def sample(places: Places, rng: jax.Array) -> jax.Array:
     """One point [k] of `places`."""
     lower, upper = np.asarray(places.lower, np.float32), np.asarray(places.upper, np.float32)

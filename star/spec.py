@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from envs.maze import yaw
+from envs.maze import uprightness, yaw
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,7 @@ class Spec:
 
     def tilt(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch"]:
         """1 - cos of the angle between the body's up axis and the world's: 0 upright, 1 on its side, 2 on its back."""
-        _, x, y, _ = jnp.moveaxis(obs[..., np.asarray(self.orientation)], -1, 0)
-        return 2.0 * (x**2 + y**2)
+        return 1.0 - uprightness(obs[..., np.asarray(self.orientation)])
 
     def turned(
         self, state: Float[Array, "*batch state"], ways: Float[Array, "*batch m"]
