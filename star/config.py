@@ -260,6 +260,7 @@ class ControllerConfig(LevelConfig):
     tilt_penalty: float = Field(
         0.0, ge=0, description="taken off the reward of every env step, times 1 - cos of the body's tilt after it"
     )
+    tilt_steps: float = Field(0.0, ge=0, description="env steps over which tilt_penalty rises linearly from 0")
     frame: Literal["world", "body"] = Field(
         "world", description="axes of velocity, tilt and subgoal as it sees them: the world's, or turned with the body"
     )

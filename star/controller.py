@@ -69,8 +69,19 @@ def reward(
 
 
 def price(
-    config: ControllerConfig, spec: Spec, next_obs: Float[Array, "*batch obs"], terminated: Float[Array, "*batch"]
+    config: ControllerConfig,
+    spec: Spec,
+    next_obs: Float[Array, "*batch obs"],
+    terminated: Float[Array, "*batch"],
+    *,
+    env_steps: Float[Array, ""] | float,
 ) -> Float[Array, "*batch"]:
-    """What is taken off the reward of an env step that led to `next_obs`, whatever the subgoal is."""
+    """What is taken off the reward of an env step that led to `next_obs`, whatever the subgoal is.
+
+    That of tilt rises linearly over the first `tilt_steps` of `env_steps`, which count all environments.
+    """
     lost = config.termination_penalty * terminated
-    return lost + config.tilt_penalty * spec.tilt(next_obs) if spec.orientation else lost
+    if not spec.orientation:
+        return lost
+    grown = jnp.minimum((env_steps + 1) / (config.tilt_steps + 1), 1.0)
+    return lost + grown * config.tilt_penalty * spec.tilt(next_obs)

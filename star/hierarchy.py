@@ -204,7 +204,8 @@ def _segment(
     key, number = inputs
     command_key, tutor_key, rollout_key, update_key, reset_key, imitation_key = jax.random.split(key, 6)
     allowed = episode.successors(config, state)
-    share = commander.epsilon(config.commander, _env_steps(spec, env, state))
+    now = _env_steps(spec, env, state)
+    share = commander.epsilon(config.commander, now)
     shares = commander.spread(config.commander, share, num_envs=env.num_envs)
     streams = episode.command(config, spec, state, allowed, streams, epsilon=shares, key=command_key)
 
@@ -212,7 +213,7 @@ def _segment(
     began = streams.env.obs
     streams, steps = episode.rollout(config, spec, env, state, streams, subgoal, deterministic=False, key=rollout_key)
 
-    experience = _controller_rollout(config, spec, steps)
+    experience = _controller_rollout(config, spec, steps, env_steps=now)
     in_hindsight = partial(_in_hindsight, config, spec) if config.controller.hindsight else None
     controller_state, controller_metrics = learner.update(
         config.controller,
@@ -363,14 +364,17 @@ def _command_in_parts(
     return commander.on_refined(config.commander, state.commander, known, decision, cells, origin)
 
 
-def _controller_rollout(config: AgentConfig, spec: Spec, steps: Steps) -> Transition:
+def _controller_rollout(
+    config: AgentConfig, spec: Spec, steps: Steps, *, env_steps: Float[Array, ""] | float
+) -> Transition:
     observe = partial(controller.observe, config.controller, spec)
     last = jnp.zeros_like(steps.alive).at[-1].set(1.0)
     reward = controller.reward(config.controller, steps.subgoal, steps.next_subgoal, size=len(spec.scale))
+    price = controller.price(config.controller, spec, steps.next_obs, steps.terminated, env_steps=env_steps)
     return Transition(
         obs=observe(spec.state(steps.obs), steps.subgoal),
         action=steps.action,
-        reward=reward - controller.price(config.controller, spec, steps.next_obs, steps.terminated),
+        reward=reward - price,
         next_obs=observe(spec.state(steps.next_obs), steps.next_subgoal),
         terminated=steps.terminated,
         cut=jnp.maximum(last, steps.ended),

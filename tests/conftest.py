@@ -188,7 +188,7 @@ def record(agent, spec, env, state, key):
             "decision": decision,
             "outcome": outcome,
             "tutor": hierarchy._tutor_transition(agent, spec, advanced, before.env.obs, action, steps),
-            "controller": hierarchy._controller_rollout(agent, spec, steps),
+            "controller": hierarchy._controller_rollout(agent, spec, steps, env_steps=0.0),
         }
         return episode.restart_ended(spec, env, advanced, steps, key=reset_key), saved
 

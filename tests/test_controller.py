@@ -128,4 +128,14 @@ def test_tilt_costs_by_the_cosine_between_the_bodys_up_axis_and_the_worlds():
         mujoco.mju_quat2Mat(rotation, orientations[n])
         expected[n] = 3 * (1 - rotation[8])
     flat = settings(tilt_penalty=3.0, termination_penalty=0.0)
-    np.testing.assert_allclose(controller.price(flat, knowledge(), obs, np.ones(50)), expected, atol=1e-5)
+    cost = controller.price(flat, knowledge(), obs, np.ones(50), env_steps=0.0)
+    np.testing.assert_allclose(cost, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("env_steps", "share"), [(0, 0), (1e6, 0.25), (4e6, 1), (9e6, 1)])
+def test_the_price_of_tilts_rises_over_the_first_env_steps_and_that_of_the_end_is_there_at_once(env_steps, share):
+    on_its_side = np.zeros((1, 14))
+    on_its_side[:, 3:5] = np.sqrt(0.5)
+    rising = settings(tilt_penalty=8.0, tilt_steps=4e6, termination_penalty=5.0)
+    cost = controller.price(rising, knowledge(), on_its_side, np.ones(1), env_steps=env_steps)
+    np.testing.assert_allclose(cost, 5 + 8 * share, atol=1e-4)

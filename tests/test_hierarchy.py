@@ -365,6 +365,7 @@ def test_a_termination_costs_its_penalty(recording):
             loading.parse(recording.config.model_dump(), {"controller.termination_penalty": price}).agent(),
             recording.spec,
             steps,
+            env_steps=0.0,
         ).reward
         for price in (0.0, 3.0)
     )
