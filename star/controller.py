@@ -78,10 +78,10 @@ def price(
 ) -> Float[Array, "*batch"]:
     """What is taken off the reward of an env step that led to `next_obs`, whatever the subgoal is.
 
-    That of tilt rises linearly over the first `tilt_steps` of `env_steps`, which count all environments.
+    The share of `tilt_penalty` rises over the first `tilt_steps` of `env_steps`, which count all environments.
     """
     lost = config.termination_penalty * terminated
     if not spec.orientation:
         return lost
-    grown = jnp.minimum((env_steps + 1) / (config.tilt_steps + 1), 1.0)
-    return lost + grown * config.tilt_penalty * spec.tilt(next_obs)
+    share = config.tilt_start ** jnp.maximum(1.0 - env_steps / config.tilt_steps, 0.0)
+    return lost + share * config.tilt_penalty * spec.tilt(next_obs)
