@@ -261,9 +261,7 @@ class ControllerConfig(LevelConfig):
         0.0, ge=0, description="taken off the reward of every env step, times 1 - cos of the body's tilt after it"
     )
     tilt_start: float = Field(1.0, gt=0, le=1, description="share of tilt_penalty that is taken off at first")
-    tilt_steps: float = Field(
-        1e6, gt=0, description="env steps over which that share rises to 1, by the same factor in each"
-    )
+    tilt_steps: float = Field(1e6, gt=0, description="env steps over which that share rises to 1, exponentially")
     frame: Literal["world", "body"] = Field(
         "world", description="axes of velocity, tilt and subgoal as it sees them: the world's, or turned with the body"
     )

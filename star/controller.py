@@ -78,7 +78,8 @@ def price(
 ) -> Float[Array, "*batch"]:
     """What is taken off the reward of an env step that led to `next_obs`, whatever the subgoal is.
 
-    The share of `tilt_penalty` rises over the first `tilt_steps` of `env_steps`, which count all environments.
+    The share of `tilt_penalty` rises exponentially over the first `tilt_steps` of `env_steps`, those of all
+    environments together.
     """
     lost = config.termination_penalty * terminated
     if not spec.orientation:
