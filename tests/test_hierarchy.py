@@ -373,6 +373,21 @@ def test_a_termination_costs_its_penalty(recording):
     assert steps.terminated.any()
 
 
+def test_an_epoch_charges_for_tilts_by_the_env_steps_before_it(breaking_env, turning, tiny):
+    epoch = turning.episode_length * B  # env steps
+    rising = {"tilt_penalty": 100.0, "tilt_start": 0.01, "tilt_steps": 2 * epoch}
+    values = loading.parse(tiny, {"commander.enabled": False, "controller": tiny["controller"] | rising})
+    agent = Epoch(breaking_env, values.model_dump(mode="json"), turning)
+    start = agent.init(jax.random.key(0))
+    first, middle, last = (
+        float(agent.one(values.agent(), start.replace(epoch=start.epoch + done))[1]["controller/reward"])
+        for done in (0, 1, 2)
+    )
+    assert agent.traces == 1
+    assert first - last > 1
+    assert (first - middle) / (first - last) == pytest.approx((0.1 - 0.01) / (1 - 0.01), rel=0.2)
+
+
 def test_what_is_reached_later_in_the_segment_is_seen_from_every_step(recording):
     steps = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.steps)
     later = np.asarray(hierarchy._later(recording.spec, steps))
