@@ -156,13 +156,14 @@ def _steps(number: float) -> str:
 
 def draw(curves: list[dict[str, Any]], path: Path) -> None:
     """success_any over env steps and over wall-clock, and how often teachers are asked."""
-    names = list(dict.fromkeys(point["name"] for point in curves))
+    names = sorted(dict.fromkeys(point["name"] for point in curves), key=lambda name: name != "star")
     unit, word = (1e6, "million") if max(point["env_steps"] for point in curves) >= 1e6 else (1e3, "thousand")
     asked = {name: _asked(curves, name) for name in names}
     panels = 3 if any(asked.values()) else 2
-    figure = Figure(figsize=(5 * panels, 4), layout="constrained")
+    figure = Figure(figsize=(5 * panels + 1.5, 4), layout="constrained")
     axes = figure.subplots(1, panels, sharey=True)
     for number, name in enumerate(names):
+        style = {"color": f"C{number % 10}", "linestyle": ("-", "--", ":")[number // 10 % 3]}
         mine = [point for point in curves if point["name"] == name]
         steps = sorted({point["env_steps"] for point in mine})
         at = [[p for p in mine if p["env_steps"] == step] for step in steps]
@@ -171,14 +172,14 @@ def draw(curves: list[dict[str, Any]], path: Path) -> None:
         )
         seconds = [np.mean([p["wall_s"] for p in points]) for points in at]
         for axis, x in zip(axes[:2], (np.asarray(steps) / unit, seconds), strict=True):
-            axis.plot(x, mean, label=name, color=f"C{number}")
+            axis.plot(x, mean, label=name, **style)
             if len(names) <= 5:
-                axis.fill_between(x, low, high, color=f"C{number}", alpha=0.15, linewidth=0)
+                axis.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
         if asked[name]:
-            axes[2].plot([step / unit for step in asked[name]], list(asked[name].values()), color=f"C{number}")
+            axes[2].plot([step / unit for step in asked[name]], list(asked[name].values()), **style)
     axes[0].set(xlabel=f"{word} env steps per seed", ylabel="success_any on test goals", ylim=(-0.02, 1.02))
     axes[1].set(xlabel="seconds, compilation included")
-    axes[1].legend()
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
     if panels > 2:
         axes[2].set(xlabel=f"{word} env steps per seed", ylabel="share of episodes with a teacher")
         axes[2].yaxis.set_tick_params(labelleft=True)
