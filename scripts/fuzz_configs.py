@@ -40,7 +40,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")  # compilation is most of the time
+# Compilation is most of the time, as in tests/conftest.py.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1",
+)
 os.environ["WANDB_MODE"] = "disabled"
 
 import hypothesis  # noqa: E402
