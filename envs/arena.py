@@ -24,8 +24,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from envs import reading
-from envs.options import EnvError, shown
+from envs.common import reading
+from envs.common.errors import shown
+from envs.options import EnvError
 
 WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE = "10rg#BD"
 SYMBOLS = (WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from envs.common.errors import UserError, shown
 
-class EnvError(ValueError):
+
+class EnvError(UserError):
     """A task, engine or option that cannot be had. The message is one line: key, value, what is allowed."""
 
 
@@ -67,14 +68,3 @@ def known(word: str, words: Iterable[str]) -> str:
     words = tuple(words)
     nearest = difflib.get_close_matches(str(word), words, n=1)
     return "allowed: " + ", ".join(words) + (f'; did you mean "{nearest[0]}"?' if nearest else "")
-
-
-def shown(value: Any, limit: int = 60) -> str:
-    """A value that a user gave, as YAML spells it where Python would not, on one line and cut short."""
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    try:
-        text = "nan" if isinstance(value, float) and math.isnan(value) else repr(value)
-    except ValueError:  # Python does not write whole numbers of thousands of digits
-        text = "a number of thousands of digits"
-    return text if len(text) <= limit else text[: limit - 3] + "..."

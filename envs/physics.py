@@ -26,7 +26,7 @@ from flax import struct
 from mujoco import rollout
 
 from envs._quiet import mjx
-from envs.batching import flattened
+from envs.common.batching import flattened
 from envs.options import EnvError
 
 CONTACTS = 24  # per environment; MJX-Warp pools them over the batch

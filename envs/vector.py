@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from envs._quiet import Env, State
-from envs.batching import flattened, shared_out, where
+from envs.common.batching import flattened, shared_out, where
 
 
 class VectorEnv:

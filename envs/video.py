@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from envs import files
+from envs.common import files
 from envs.options import EnvError
 
 STILLS = (".png", ".jpg")

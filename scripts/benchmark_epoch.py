@@ -21,9 +21,11 @@ import jax
 import jax.numpy as jnp
 
 import envs
-from star import cli, hierarchy, refinement
-from star import forward_model as models
+from star import cli
 from star import program as programs
+from star.abstraction import forward_model as models
+from star.abstraction import refinement
+from star.agent import epoch as hierarchy
 from star.loading import load
 
 

@@ -56,7 +56,7 @@ from hypothesis import strategies as st  # noqa: E402
 from envs import EnvError, arena  # noqa: E402
 from star import cli, loading, provenance  # noqa: E402
 from star import program as programs  # noqa: E402
-from star.config import Config  # noqa: E402
+from star.agent.sections import Config  # noqa: E402
 
 FINE = ("trained", "stopped", "built", "refused", "helped")
 CHUNK = 100  # configs of one seed of hypothesis

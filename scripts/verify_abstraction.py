@@ -28,15 +28,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.vector import VectorEnv
-from star import episode, forward_model, hierarchy
 from star import program as programs
+from star.abstraction import forward_model
+from star.abstraction.reachability import MISSES, REACHES
+from star.agent import epoch as hierarchy
+from star.agent import play as episode
+from star.agent.commander import Decision, Successors
+from star.agent.sections import AgentConfig
+from star.agent.state import TrainState
 from star.checkpoint import load_state
-from star.commander import Decision, Successors
-from star.config import AgentConfig
 from star.loading import load
-from star.reachability import MISSES, REACHES
 from star.spec import Spec
-from star.state import TrainState
 
 NEAR_WALL = 1.0  # m
 

@@ -30,14 +30,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from star import forward_model, provenance, reachability
 from star import program as programs
+from star import provenance
+from star.abstraction import forward_model, reachability
+from star.abstraction.forward_model import ForwardModelState
+from star.abstraction.reachability import Network
+from star.abstraction.sections import ForwardModelConfig
+from star.agent.sections import AgentConfig
+from star.agent.state import TrainState
 from star.checkpoint import load_state
-from star.config import AgentConfig, ForwardModelConfig
-from star.forward_model import ForwardModelState
 from star.loading import load, parse
-from star.reachability import Network
-from star.state import TrainState
 
 NETWORKS = [  # widths of input, hidden layers and output; residual
     ((2, 2), True),

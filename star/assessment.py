@@ -24,10 +24,12 @@ from rich.console import Console
 
 from envs import routes
 from envs.vector import VectorEnv
-from star import checkpoint, episode, evaluation, report
+from star import checkpoint, evaluation, report
 from star import program as programs
+from star.agent import play as episode
+from star.agent.sections import Config
 from star.checkpoint import Checkpoints, check_compatible
-from star.config import Config, ConfigError
+from star.config.section import ConfigError
 from star.evaluation import MEASURES, Trials
 from star.loading import parse
 from star.program import Program
@@ -84,7 +86,7 @@ def prepare(config: Config, exam: Exam, *, episodes: int, source: Path) -> Cours
     """The course of `episodes` episodes for the agents of the run `source`, whose settings are `config`.
 
     Raises:
-      ConfigError: in one line, if they cannot act there, or there are not as many episodes as goals.
+      UserError: in one line, if they cannot act there, or there are not as many episodes as goals.
     """
     program = programs.build(config)
     task = elsewhere(config, exam.task)
@@ -180,7 +182,7 @@ def evaluate(targets: Sequence[Target], exam: Exam, *, quiet: bool = True) -> li
     the first episode is played.
 
     Raises:
-      ConfigError: in one line, for whatever cannot be evaluated.
+      UserError: in one line, for whatever cannot be evaluated.
     """
     console = Console(stderr=True)
     busy = contextlib.nullcontext() if quiet or not console.is_terminal else console.status("preparing")
@@ -371,7 +373,7 @@ def _task(env: str, options: Mapping[str, Any]) -> str:
 
 
 def check_groups(groups: Mapping[str, Sequence[Path]], configs: Mapping[Path, Config]) -> None:
-    """Raise `ConfigError` if a group holds a seed of a task twice: it would count as two."""
+    """Raise `UserError` if a group holds a seed of a task twice: it would count as two."""
     for name, runs in groups.items():
         seen: dict[tuple[str, int], Path] = {}
         for run in runs:
@@ -384,7 +386,7 @@ def check_groups(groups: Mapping[str, Sequence[Path]], configs: Mapping[Path, Co
 
 
 def check_place(out: Path, *, force: bool) -> None:
-    """Raise `ConfigError` if `write` could not write into the folder `out`, or would replace something there."""
+    """Raise `UserError` if `write` could not write into the folder `out`, or would replace something there."""
     above = next(path for path in (out, *out.absolute().parents) if path.exists())
     if not above.is_dir():
         raise ConfigError(f"--out: {out}: {above} is a file, not a folder")

@@ -29,14 +29,15 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from envs import files
+from envs.common import files
 from star import devices, provenance
 from star import program as programs
-from star.config import Config, ConfigError
+from star.agent.sections import Config
+from star.agent.state import TrainState, leaf_name
+from star.config.section import ConfigError
 from star.loading import fields, parse
 from star.migrations import FORMAT, About, Arrays, migrated, migrated_arrays, readable
 from star.program import Program
-from star.state import TrainState, leaf_name
 
 SUMS = "SHA256SUMS"
 _ABOUT = "about.json"
@@ -71,7 +72,7 @@ class Checkpoints:
     def save(self, env_steps: int, state: TrainState, config: Config, *, success: float) -> None:
         """Write `state` as `checkpoints/<env_steps>`; `success` is the latest evaluation's, which decides the best.
 
-        Raises `ConfigError` if that cannot be done; what was there before still is. Several processes call this alike;
+        Raises `UserError` if that cannot be done; what was there before still is. Several processes call this alike;
         each writes its share of the arrays, the first one the rest.
         """
         about = {"format": FORMAT, "env_steps": env_steps, "success_final": success}
@@ -199,7 +200,7 @@ class Checkpoints:
         return self._open().restore(path.absolute() / "state", args=ocp.args.StandardRestore(template))
 
     def _about(self, step: int) -> About:
-        """What a checkpoint says of itself, in its own format; raises `ConfigError` if that is none we read."""
+        """What a checkpoint says of itself, in its own format; raises `UserError` if that is none we read."""
         path = self._path / str(step)
         try:
             about = json.loads((_older(path) if _older(path).exists() else path / _ABOUT).read_text(encoding="utf-8"))
@@ -313,7 +314,7 @@ def choose(checkpoints: Checkpoints, run_dir: Path, wanted: str) -> int:
 
 
 def restore(program: Program, checkpoints: Checkpoints, step: int, *, source: Path) -> TrainState:
-    """The state of all seeds in the checkpoint at `step`; raises `ConfigError` if it is none of `program`."""
+    """The state of all seeds in the checkpoint at `step`; raises `UserError` if it is none of `program`."""
     check_compatible(checkpoints.config(step), program.config, source=source)
     return checkpoints.restore(step, program.example())
 

@@ -18,8 +18,11 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import yaml
 from rich.console import Console
 
-from envs import reading
-from star.config import Config, ConfigError, TrainerConfig
+from envs.common import reading
+from envs.common.errors import UserError
+from star.agent.sections import Config
+from star.config.run import TrainerConfig
+from star.config.section import ConfigError
 from star.loading import fields, load, parse
 from star.stopping import at_once, end, leave
 
@@ -84,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGINT, at_once)
     try:
         code = _run(sys.argv[1:] if arguments is None else list(arguments))
-    except ConfigError as error:
+    except UserError as error:
         print(f"error: {_on_one_line(str(error))}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
@@ -263,7 +266,7 @@ def _add_report(report: argparse.ArgumentParser) -> None:
 def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
     """Take the dotted settings `--section.key VALUE` or `--section.key=VALUE` out of `arguments`.
 
-    Returns the other words, and the settings; raises `ConfigError` for a setting without a value.
+    Returns the other words, and the settings; raises `UserError` for a setting without a value.
     """
     words: list[str] = []
     found: dict[str, Any] = {}
@@ -551,13 +554,10 @@ def _render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
 def _check_output(options: argparse.Namespace) -> None:
     """Refuse a file that cannot be written, or a machine that cannot draw, before anything heavy is imported."""
-    from envs import EnvError, opengl, video
+    from envs import opengl, video
 
-    try:
-        video.check(options.out, force=options.force)
-        opengl.backend()
-    except EnvError as error:
-        raise ConfigError(str(error)) from None
+    video.check(options.out, force=options.force)
+    opengl.backend()
 
 
 def _record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
@@ -583,12 +583,9 @@ def _record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
 def _report(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     _refuse(overrides)
-    from envs import EnvError, files
+    from envs.common import files
 
-    try:
-        files.check(options.out, (".html",), force=options.force)
-    except EnvError as error:
-        raise ConfigError(str(error)) from None
+    files.check(options.out, (".html",), force=options.force)
     groups = _groups(options.group)
     chosen = [run for members in groups.values() for run in members] + options.runs
     if not chosen:

@@ -13,24 +13,12 @@ from jaxtyping import AbstractArray, install_import_hook
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_CHECKED = (  # the modules with annotated arrays, which must not be imported yet
+_CHECKED = (
     "abstraction",
-    "adjacency",
-    "commander",
-    "controller",
-    "episode",
-    "forward_model",
-    "hierarchy",
-    "learner",
-    "networks",
-    "ppo",
-    "reachability",
-    "refinement",
-    "replay",
+    "agent",
+    "learners",
     "sgim",
-    "td3",
-    "tutor",
-)
+)  # packages with annotated arrays; their sections may be imported
 
 
 def turn_on() -> None:

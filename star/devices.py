@@ -1,9 +1,9 @@
 """Several devices: environments and replay are shared out among them, everything else is whole on each.
 
-The devices form a mesh with one axis. The environments step inside `jax.shard_map` (`envs.batching.shared_out`); the
-rest of an epoch is one program that JAX's partitioner cuts, told by `share` and `whole` where data is to lie. Both do
-nothing where there is no mesh. Random numbers do not depend on how they are cut, so that any number of devices
-computes the same but for the rounding of sums.
+The devices form a mesh with one axis. The environments step inside `jax.shard_map`
+(`envs.common.batching.shared_out`); the rest of an epoch is one program that JAX's partitioner cuts, told by `share`
+and `whole` where data is to lie. Both do nothing where there is no mesh. Random numbers do not depend on how they are
+cut, so that any number of devices computes the same but for the rounding of sums.
 
 Several processes, each with devices of its own, run the same program in step. Only the `first` of them writes.
 """
@@ -20,14 +20,14 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 
-from envs.batching import AXIS
-from star.config import ConfigError
+from envs.common.batching import AXIS
+from star.config.section import ConfigError
 
 _WHOLE = PartitionSpec()
 
 
 def mesh(count: int) -> Mesh | None:
-    """The first `count` devices of all processes, None for one; raises `ConfigError` if there are not so many.
+    """The first `count` devices of all processes, None for one; raises `UserError` if there are not so many.
 
     Several processes must use all their devices.
     """
@@ -102,7 +102,7 @@ def as_on_first(tree: Any) -> Any:
 
 
 def join(cluster: str) -> None:
-    """Become one of several processes, before JAX looks for devices; raises `ConfigError`.
+    """Become one of several processes, before JAX looks for devices; raises `UserError`.
 
     `cluster` is HOST:PORT,NUMBER,COUNT: where the first process listens, the number of this one from 0, and how many
     there are; or "auto" for what SLURM, Open MPI and the like say of themselves.

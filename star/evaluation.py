@@ -14,7 +14,7 @@ from flax import struct
 from jaxtyping import Array, Float
 from scipy import stats
 
-from star.episode import Episode
+from star.agent.play import Episode
 
 MEASURES = ("success_any", "success_final")
 TAUS = np.linspace(0.0, 1.0, 101)  # where performance profiles are taken

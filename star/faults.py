@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from star.state import TrainState, leaf_name
+from star.agent.state import TrainState, leaf_name
 
 Row = Mapping[str, Any]
 Tree = TypeVar("Tree")

@@ -16,7 +16,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from star.config import Config, ConfigError
+from star.agent.sections import Config
+from star.config.section import ConfigError
 from star.loading import changed, dotted, parse
 from star.metrics import Journal, JsonLines, by_step
 
@@ -68,7 +69,7 @@ def read(run_dir: Path, config: Config, *, name: str) -> Run:
     """The complete lines of a run, which may still be going on.
 
     Raises:
-      ConfigError: in one line, if there is no complete epoch yet, or a line is not what a run writes.
+      UserError: in one line, if there is no complete epoch yet, or a line is not what a run writes.
     """
     journal = Journal.of(run_dir)
     seeds = config.trainer.num_seeds
@@ -93,7 +94,7 @@ def together(name: str, runs: Sequence[Run]) -> Run:
     """The seeds of several runs as those of one, as far as all have come.
 
     Raises:
-      ConfigError: in one line, if they differ in more than their seeds, or two have trained the same seed.
+      UserError: in one line, if they differ in more than their seeds, or two have trained the same seed.
     """
     for run in runs[1:]:
         differ = {row["key"] for row in differences([settings(runs[0]), settings(run)])} - _OF_SEEDS

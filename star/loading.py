@@ -12,16 +12,18 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from envs import reading
-from envs.options import shown
-from star.config import Config, ConfigError, Section
+from envs.common import reading
+from envs.common.errors import shown
+from envs.common.files import nearest_file
+from star.agent.sections import Config
+from star.config.section import ConfigError, Section
 
 
 def load(path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers: Sequence[str | Path] = ()) -> Config:
     """Read a YAML file, lay others over it, apply dotted overrides such as `{"tutor.period": 5}` and validate.
 
     Raises:
-      ConfigError: with one line that names the key, the value and what is allowed.
+      UserError: with one line that names the key, the value and what is allowed.
 
     """
     values: dict[str, Any] = {}
@@ -44,7 +46,7 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 
 
 def read_file(path: Path) -> dict[str, Any]:
-    """What a YAML file with sections holds; raises `ConfigError`."""
+    """What a YAML file with sections holds; raises `UserError`."""
     try:
         values = reading.plain(reading.text(path))
     except FileNotFoundError:
@@ -65,7 +67,7 @@ def read_file(path: Path) -> dict[str, Any]:
 def parse(
     values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, *, source: str = "configuration"
 ) -> Config:
-    """Validate nested `values` after applying dotted `overrides`; raises `ConfigError`."""
+    """Validate nested `values` after applying dotted `overrides`; raises `UserError`."""
     nested = _with_overrides(values, overrides or {})
     try:
         return Config.model_validate(nested)
@@ -74,7 +76,7 @@ def parse(
 
 
 def check_setting(config: Config, key: str, value: Any, *, source: str) -> None:
-    """Raise `ConfigError` if there is no setting `key`, or `value` is none of its values whatever the others are."""
+    """Raise `UserError` if there is no setting `key`, or `value` is none of its values whatever the others are."""
     try:
         Config.model_validate(_with_overrides(config.model_dump(mode="json"), {key: value}))
     except ValidationError as error:
@@ -173,13 +175,3 @@ def _nearest_key(path: Sequence[str], model: type[BaseModel]) -> str:
     if matches:
         return f" (did you mean {everywhere[matches[0]]}?)"
     return f" (allowed: {', '.join(section.model_fields)})"
-
-
-def nearest_file(path: Path, endings: Sequence[str]) -> str:
-    """` (did you mean ...?)` with the file beside `path` whose name is most like it, of those with these endings."""
-    try:
-        names = [entry.name for entry in path.parent.iterdir() if entry.suffix in endings]
-    except (OSError, ValueError):  # no such folder, or not one of ours
-        return ""
-    matches = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
-    return f" (did you mean {path.parent / matches[0]}?)" if matches else ""

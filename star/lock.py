@@ -9,17 +9,18 @@ import platform
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from star.config import ConfigError
+from envs.common.errors import UserError
+from star.config.section import ConfigError
 
 NAME = ".lock"
 
 
 @contextlib.contextmanager
 def locked(run_dir: Path, *, warn: Callable[[str], None]) -> Iterator[None]:
-    """Hold `run_dir` alone; raises `ConfigError` if another process does, or if the folder cannot be written.
+    """Hold `run_dir` alone; raises `UserError` if another process does, or if the folder cannot be written.
 
     The system releases the lock when the process ends, however it does; the file stays, unless it is new and what was
-    to be done is refused with `ConfigError`. Where the file system cannot lock, that is said, and nothing is held.
+    to be done is refused with `UserError`. Where the file system cannot lock, that is said, and nothing is held.
     """
     path = run_dir / NAME
     new = not path.exists()
@@ -43,7 +44,7 @@ def locked(run_dir: Path, *, warn: Callable[[str], None]) -> Iterator[None]:
                 file.flush()
         try:
             yield
-        except ConfigError:
+        except UserError:
             if new:
                 path.unlink(missing_ok=True)
             raise

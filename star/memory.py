@@ -8,15 +8,15 @@ from typing import Any
 
 import jax
 
-from star import state as states
-from star.config import ConfigError
+from star.agent import state as states
+from star.config.section import ConfigError
 from star.program import Program
 
 _NUMBER = 4  # bytes
 
 
 def check(program: Program, *, copies: int = 1) -> None:
-    """Raise `ConfigError` if so many runs of `program` side by side cannot fit into the memory of the device."""
+    """Raise `UserError` if so many runs of `program` side by side cannot fit into the memory of the device."""
     found, room = needed(program), available(program.config.trainer.devices)
     total = copies * sum(found.values())
     if total > room:

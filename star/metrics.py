@@ -13,12 +13,12 @@ from typing import Any
 
 import jax
 
-from envs import EnvError, files
-from star.config import ConfigError
+from envs.common import files
+from star.config.section import ConfigError
 
 
 class JsonLines:
-    """A file with one object a line, flushed at once. A row that cannot be written raises `ConfigError`.
+    """A file with one object a line, flushed at once. A row that cannot be written raises `UserError`.
 
     With `muted` it is only read: somebody else writes it.
     """
@@ -45,7 +45,7 @@ class JsonLines:
             raise ConfigError(f"{self.path}: cannot be written: {error.strerror}") from None
 
     def read(self) -> list[dict[str, Any]]:
-        """All complete lines so far; raises `ConfigError` in one line that says which is none of ours."""
+        """All complete lines so far; raises `UserError` in one line that says which is none of ours."""
         if not self.path.exists():
             return []
         try:
@@ -75,11 +75,8 @@ class JsonLines:
             self._replace(self.read())
 
     def _replace(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        try:
-            with files.whole(self.path) as path:
-                path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
-        except EnvError as error:
-            raise ConfigError(str(error)) from None
+        with files.whole(self.path) as path:
+            path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
 
     def sync(self) -> None:
         """Have all lines survive a loss of power."""

@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from envs import files, video
+from envs import video
 from envs.arena import ROBOT
-from envs.options import EnvError
+from envs.common import files
 from star import evaluation, history, report
 from star import program as programs
-from star.config import Config, ConfigError
+from star.agent.sections import Config
 from star.history import NUMBER, Row, Run
 
 MAX_POINTS = 300  # of a curve
@@ -43,20 +43,17 @@ def write(runs: Mapping[Path, Config], out: Path, *, groups: Mapping[str, Sequen
     Those of each of the `groups` are shown as one run, before the others. An existing file is replaced.
 
     Raises:
-      ConfigError: in one line, if a run, a group or `out` cannot be used; nothing is written then.
+      UserError: in one line, if a run, a group or `out` cannot be used; nothing is written then.
     """
     programs.select_device("cpu")  # a GPU may be busy with one of the runs
-    try:
-        found = {
-            path: history.read(path, config, name=name)
-            for (path, config), name in zip(runs.items(), report.labels(list(runs)), strict=True)
-        }
-        merged = [history.together(name, [found.pop(path) for path in paths]) for name, paths in (groups or {}).items()]
-        page = html(content([*merged, *found.values()]))
-        with files.whole(out) as partial:
-            partial.write_text(page, encoding="utf-8")
-    except EnvError as error:
-        raise ConfigError(str(error)) from None
+    found = {
+        path: history.read(path, config, name=name)
+        for (path, config), name in zip(runs.items(), report.labels(list(runs)), strict=True)
+    }
+    merged = [history.together(name, [found.pop(path) for path in paths]) for name, paths in (groups or {}).items()]
+    page = html(content([*merged, *found.values()]))
+    with files.whole(out) as partial:
+        partial.write_text(page, encoding="utf-8")
     return f"{out}: {len(runs)} run{'s' * (len(runs) > 1)}, {out.stat().st_size / 1e6:.1f} MB; open it in a browser"
 
 

@@ -9,7 +9,7 @@ from typing import Any, Self, TypeVar
 
 import jax
 
-from star.config import ConfigError
+from star.config.section import ConfigError
 
 T = TypeVar("T")
 
@@ -70,7 +70,7 @@ def timed(function: Callable[..., T], *arguments: Any) -> tuple[float, T]:
 def plan(*, done: int, total: int, eval_every: int, epochs: int) -> int:
     """After how many epochs a trace of `epochs` epochs begins: nothing compiles while it lasts.
 
-    `done` of `total` epochs are over; the next one compiles, and so does the first evaluation. Raises `ConfigError` if
+    `done` of `total` epochs are over; the next one compiles, and so does the first evaluation. Raises `UserError` if
     too few epochs are left.
     """
     first = done + 1

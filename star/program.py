@@ -16,16 +16,20 @@ from jax.sharding import Mesh
 import envs
 from envs import arena
 from envs.vector import VectorEnv
-from star import devices, episode, hierarchy
-from star import state as states
-from star.config import AgentConfig, Config, ConfigError, TeacherConfig
-from star.episode import Episode
+from star import devices
+from star.agent import epoch as hierarchy
+from star.agent import play as episode
+from star.agent import state as states
+from star.agent.play import Episode
+from star.agent.sections import AgentConfig, Config
+from star.agent.state import TrainState
+from star.config.section import ConfigError
+from star.learners.td3 import TD3State
 from star.loading import parse
 from star.sgim import teachers
+from star.sgim.sections import TeacherConfig
 from star.sgim.teachers import Demonstrations
 from star.spec import Spec
-from star.state import TrainState
-from star.td3 import TD3State
 
 # Streams of random keys that no seed of training uses.
 DURING_TRAINING = 2**32 - 1
@@ -56,7 +60,7 @@ class Program:
     agent: AgentConfig
     """What is traced: the floats of `config`, or arrays of them with the leading axis of states and keys."""
     lessons: Callable[[], tuple[Demonstrations, ...]]
-    """What the teachers show, read when it is first needed; raises `ConfigError`."""
+    """What the teachers show, read when it is first needed; raises `UserError`."""
     functions: Functions
 
     def init(self, keys: jax.Array) -> TrainState:
@@ -103,7 +107,7 @@ class Program:
 
 
 def build(config: Config) -> Program:
-    """Make the environments and the jitted functions of `config`; raises `ConfigError` if they cannot be made."""
+    """Make the environments and the jitted functions of `config`; raises `UserError` if they cannot be made."""
     select_device(config.trainer.device)
     env, test_env = (make_env(config, goals) for goals in ("train", "test"))
     spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
@@ -163,7 +167,7 @@ def build(config: Config) -> Program:
 
 
 def select_device(device: str) -> None:
-    """Make JAX use the device that `trainer.device` asks for; raises `ConfigError` if there is none."""
+    """Make JAX use the device that `trainer.device` asks for; raises `UserError` if there is none."""
     if device == "cpu":
         jax.config.update("jax_platforms", "cpu")
     if device == "gpu" and jax.default_backend() != "gpu":
@@ -252,7 +256,7 @@ def _axis(agent: AgentConfig) -> int | None:
 
 
 def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: Any, spec: Spec) -> Demonstrations:
-    """What a teacher shows; raises `ConfigError` if that is not what it should be."""
+    """What a teacher shows; raises `UserError` if that is not what it should be."""
     if teacher.source == "map":
         demos = teachers.shortest_paths(env)
     else:

@@ -13,10 +13,11 @@ from flax import struct
 from rich.console import Console
 
 from envs.vector import VectorEnv
-from star import episode
 from star import program as programs
+from star.agent import play as episode
+from star.agent.sections import Config
 from star.checkpoint import load_agent
-from star.config import Config, ConfigError
+from star.config.section import ConfigError
 from star.sgim import teachers
 from star.sgim.teachers import Demonstrations
 from star.spec import Spec
@@ -50,7 +51,7 @@ def record(
     It is the agent of seed `agent` (None: the first); `seed` chooses starts and goals.
 
     Raises:
-      ConfigError: in one line, for whatever cannot be had; nothing is written then.
+      UserError: in one line, for whatever cannot be had; nothing is written then.
     """
     teachers.check_place(out, force=force)
     with contextlib.nullcontext() if quiet else Console(stderr=True).status("recording"):

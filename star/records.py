@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from star import report
+from star.agent.state import TrainState
 from star.metrics import Journal, by_step, mean
 from star.program import Program
-from star.state import TrainState
 
 
 class Records:

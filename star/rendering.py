@@ -19,16 +19,17 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from envs import video
-from envs.options import EnvError
 from envs.render import FINE_SHADOWS, SHADOWS, Marks, Painter, Stage, aspect_of
 from envs.topdown import Sheet, tiled
 from envs.vector import VectorEnv
-from star import assessment, episode
+from star import assessment
 from star import program as programs
+from star.agent import play as episode
+from star.agent.sections import Config
+from star.agent.tutor import Box
 from star.assessment import Exam
 from star.checkpoint import agent_number, load_state
-from star.config import Config, ConfigError
-from star.tutor import Box
+from star.config.section import ConfigError
 
 MAX_ENVS = 25
 HEIGHTS = ((1, 480), (4, 320), (9, 240), (MAX_ENVS, 180))  # pixels of a tile, by the number of environments
@@ -97,30 +98,27 @@ def render(
     random actions.
 
     Raises:
-      ConfigError: in one line, for whatever cannot be had; nothing is written then.
+      UserError: in one line, for whatever cannot be had; nothing is written then.
     """
-    try:
-        with _progress(Console(stderr=True), quiet) as progress:
-            task = progress.add_task("recording", total=None)
-            if run_dir is None:
-                recording = record_random(config, envs=show.envs, steps=show.steps, seed=exam.seed)
-            else:
-                recording = record_run(
-                    config,
-                    run_dir,
-                    checkpoint=checkpoint,
-                    agent=agent,
-                    envs=show.envs,
-                    steps=show.steps,
-                    exam=exam,
-                    number=episode,
-                )
-            times = moments_shown(len(recording.moments.obs), show)
-            progress.update(task, description="drawing", total=len(times))
-            pictures = _ticking(draw(recording, show, times), progress, task)
-            written = video.write(show.out, pictures, fps=show.fps)
-    except EnvError as error:
-        raise ConfigError(str(error)) from None
+    with _progress(Console(stderr=True), quiet) as progress:
+        task = progress.add_task("recording", total=None)
+        if run_dir is None:
+            recording = record_random(config, envs=show.envs, steps=show.steps, seed=exam.seed)
+        else:
+            recording = record_run(
+                config,
+                run_dir,
+                checkpoint=checkpoint,
+                agent=agent,
+                envs=show.envs,
+                steps=show.steps,
+                exam=exam,
+                number=episode,
+            )
+        times = moments_shown(len(recording.moments.obs), show)
+        progress.update(task, description="drawing", total=len(times))
+        pictures = _ticking(draw(recording, show, times), progress, task)
+        written = video.write(show.out, pictures, fps=show.fps)
     return f"{show.out}: {written} picture{'s' * (written > 1)}; {_outcome(recording)}"
 
 

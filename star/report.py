@@ -16,12 +16,13 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from star import commander, episode
-from star.abstraction import locate
-from star.config import AgentConfig
+from star.abstraction.regions import locate
+from star.agent import commander
+from star.agent import play as episode
+from star.agent.sections import AgentConfig
+from star.agent.state import TrainState
 from star.evaluation import MEASURES
 from star.sgim import selection
-from star.state import TrainState
 
 _MAX_PANELS = 5
 _GROWTH_PANELS = 4

@@ -13,10 +13,10 @@ import jax
 import numpy as np
 
 from star import devices, faults
+from star.agent.state import TrainState
 from star.faults import Fault
 from star.metrics import Journal
 from star.program import Program
-from star.state import TrainState
 
 
 def goes_back(program: Program, journal: Journal, fault: Fault, *, to: int | None, warn: Callable[[str], None]) -> bool:

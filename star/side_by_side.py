@@ -9,12 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.batching import where
+from envs.common.batching import where
 from star import evaluation, memory
 from star import program as programs
-from star.config import Config
+from star.agent.sections import Config
+from star.agent.state import TrainState
 from star.metrics import of_epoch
-from star.state import TrainState
 
 _where = jax.jit(where)
 
@@ -26,7 +26,7 @@ class SideBySide:
     """
 
     def __init__(self, config: Config, slots: int) -> None:
-        """Compile for `slots` runs like `config`; raises `ConfigError` if it cannot be trained."""
+        """Compile for `slots` runs like `config`; raises `UserError` if it cannot be trained."""
         program = programs.build(config)
         program.lessons()
         memory.check(program, copies=slots)

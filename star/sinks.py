@@ -20,7 +20,8 @@ from operator import methodcaller
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from star.config import Config, ConfigError
+from star.agent.sections import Config
+from star.config.section import ConfigError
 from star.metrics import by_step, mean
 
 Row = Mapping[str, Any]
@@ -259,7 +260,7 @@ class Worker:
 
 
 def check(config: Config) -> None:
-    """Raise `ConfigError` if a package that a sink of `config` needs is not installed."""
+    """Raise `UserError` if a package that a sink of `config` needs is not installed."""
     for name in config.trainer.sinks:
         if name in _EXTRAS and importlib.util.find_spec(name) is None:
             raise ConfigError(f'trainer.sinks: {name} is not installed; install it with pip install "star-rl[{name}]"')

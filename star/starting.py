@@ -6,15 +6,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from envs import EnvError, files
+from envs.common import files
 from star import checkpoint, devices, lock
 from star import program as programs
+from star.agent.sections import Config
+from star.agent.state import TrainState
 from star.checkpoint import Checkpoints
-from star.config import Config, ConfigError
+from star.config.section import ConfigError
 from star.loading import changed, dotted, load
 from star.metrics import Journal
 from star.program import Program
-from star.state import TrainState
 
 _BEGUN = (lock.NAME, ".config-")  # of a run that was killed before its config.yaml was written
 
@@ -37,11 +38,8 @@ def note(run_dir: Path, config: Config) -> None:
     """Write the config of a new run into its folder."""
     if not devices.first():
         return
-    try:
-        with files.whole(run_dir / "config.yaml") as path:
-            path.write_text(config.to_yaml(), encoding="utf-8")
-    except EnvError as error:
-        raise ConfigError(str(error)) from None
+    with files.whole(run_dir / "config.yaml") as path:
+        path.write_text(config.to_yaml(), encoding="utf-8")
 
 
 def settings(run_dir: Path, program: Program) -> dict[str, Any]:

@@ -12,17 +12,17 @@ import numpy as np
 from rich.console import Console
 
 from star import checkpoint, devices, evaluation, faults, report
+from star.agent.play import Episode
+from star.agent.state import TrainState
 from star.checkpoint import Checkpoints
-from star.config import ConfigError
+from star.config.section import ConfigError
 from star.display import Display, Stopwatch
-from star.episode import Episode
 from star.faults import Fault
 from star.metrics import of_epoch
 from star.profiling import Profile
 from star.program import Program
 from star.records import Records
 from star.sinks import Sinks
-from star.state import TrainState
 from star.stopping import Overdue, Stop
 
 _LONG_S = 3.0  # of what is to come a copy of the state is worth its time; shorter parts end in good time after SIGTERM

@@ -31,7 +31,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.pool import NullPool
 
-from star.config import ConfigError
+from star.config.section import ConfigError
 
 RETRIES = 3
 _DESCRIPTION = "sweep"  # user attribute of a study: what it searches and how
@@ -267,7 +267,7 @@ def reason(trial: FrozenTrial) -> str:
 
 
 def sqlalchemy_url(url: str) -> sqlalchemy.URL:
-    """The address of a database; raises `ConfigError` if it is none of SQLite or PostgreSQL."""
+    """The address of a database; raises `UserError` if it is none of SQLite or PostgreSQL."""
     try:
         read = sqlalchemy.make_url(url)
     except sqlalchemy.exc.ArgumentError:
@@ -282,7 +282,7 @@ def sqlalchemy_url(url: str) -> sqlalchemy.URL:
 
 @contextlib.contextmanager
 def reachable(url: sqlalchemy.URL | str) -> Iterator[None]:
-    """Turn what a database refuses into a `ConfigError` of one line."""
+    """Turn what a database refuses into a `UserError` of one line."""
     shown = (url if isinstance(url, sqlalchemy.URL) else sqlalchemy_url(url)).render_as_string()
     try:
         yield

@@ -31,11 +31,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from envs import EnvError, files
-from envs.options import shown
+from envs.common import files
+from envs.common.errors import UserError, shown
 from star import faults, sweep_report
 from star import program as programs
-from star.config import Config, ConfigError, Positive
+from star.agent.sections import Config
+from star.config.section import ConfigError, Positive
 from star.loading import check_setting, explain, kind, load, parse, read_file
 from star.metrics import mean
 from star.side_by_side import SideBySide
@@ -184,7 +185,7 @@ class Plan:
         return self.file.trials if self.grid is None else min(self.file.trials, len(self.grid))
 
     def config(self, parameters: Mapping[str, Any]) -> Config:
-        """That of a trial; raises `ConfigError` if these values do not go together."""
+        """That of a trial; raises `UserError` if these values do not go together."""
         return parse(self.base.model_dump(mode="json"), self.values(parameters), source="trial")
 
     def values(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -197,7 +198,7 @@ class Plan:
 
 
 def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: Any) -> Plan:
-    """Read and check a sweep file; raises `ConfigError`.
+    """Read and check a sweep file; raises `UserError`.
 
     `settings` are laid over those of all trials, and `changes`, such as `trials=8`, over the file's own fields.
     """
@@ -225,7 +226,7 @@ def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: An
 
 
 def open_ledger(found: Plan, url: str, *, beat_s: int = 15, grace_s: int = 90) -> Ledger:
-    """The study of a sweep in the database at `url`; raises `ConfigError`."""
+    """The study of a sweep in the database at `url`; raises `UserError`."""
     return Ledger(
         url,
         found.name,
@@ -250,7 +251,7 @@ def run(
     """Work on a sweep until all its trials have ended and write the results to `out`.
 
     Without a `storage` the database is `sweep.db` in `out`. A sweep that is there already goes on.
-    Raises `ConfigError` for what cannot be used.
+    Raises `UserError` for what cannot be used.
     """
     database = out / "sweep.db"
     if storage is None and not database.exists() and out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -268,13 +269,10 @@ def run(
             trials, shares = ledger.trials(), sweep_report.importance(ledger.study)
     rows = [_row(found, trial) for trial in trials]
     best = _best(rows)
-    try:
-        sweep_report.write(out, rows, parameters=list(found.distributions), objective=found.objective, shares=shares)
-        if best is not None:
-            with files.whole(out / "best.yaml") as path:
-                path.write_text(found.config(trials[rows.index(best)].params).to_yaml(), encoding="utf-8")
-    except EnvError as error:
-        raise ConfigError(str(error)) from None
+    sweep_report.write(out, rows, parameters=list(found.distributions), objective=found.objective, shares=shares)
+    if best is not None:
+        with files.whole(out / "best.yaml") as path:
+            path.write_text(found.config(trials[rows.index(best)].params).to_yaml(), encoding="utf-8")
     return Summary(rows, finished, best)
 
 
@@ -351,7 +349,7 @@ class _Worker:
         for trial in asked:
             try:
                 self.queue.append(_Run(trial, self.found.config(trial.params)))
-            except ConfigError as error:
+            except UserError as error:
                 self._end(trial, None, reason=str(error))
 
     def others_at_work(self) -> bool:
@@ -367,7 +365,7 @@ class _Worker:
         self.display.update(status=f"compiling for {len(slots)} trials side by side")
         try:
             self._train(self.make(slots[0].config, len(slots)), slots, shared)
-        except ConfigError as error:
+        except UserError as error:
             self._fail(slots, str(error))
         except (RuntimeError, MemoryError) as error:  # such as no memory left on the device
             self._fail(slots, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}")

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 from rich.text import Text
 
-from envs import files
+from envs.common import files
 from star.report import literal, save
 
 Row = Mapping[str, Any]

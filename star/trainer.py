@@ -12,13 +12,13 @@ from rich.console import Console
 
 from star import devices, memory, profiling, provenance, rollback, sinks, starting
 from star import program as programs
+from star.agent.sections import Config
+from star.agent.state import TrainState
 from star.checkpoint import Checkpoints
-from star.config import Config
 from star.lock import locked
 from star.metrics import Journal
 from star.program import Program
 from star.records import Records
-from star.state import TrainState
 from star.stopping import interruptible
 from star.stretch import Result, Stretch
 
@@ -37,7 +37,7 @@ def train(
     So does SIGTERM, and it waits no longer than `star.stopping.GRACE_S` for the epoch under way; after that the
     checkpoint is of the one before it. Where numbers are no longer finite it returns too, or goes back and on, as
     `trainer.on_non_finite` says. `profile` is the number of epochs that JAX's profiler traces, to `run_dir/profile`.
-    What cannot be written, as on a full disk, raises `ConfigError`. Several processes (`devices.join`) call this alike,
+    What cannot be written, as on a full disk, raises `UserError`. Several processes (`devices.join`) call this alike,
     and only the first of them writes anything but its share of the checkpoints.
     """
     sinks.check(config)
@@ -92,7 +92,7 @@ def _epochs(state: TrainState) -> int:
 
 
 def _traced(program: Program, checkpoints: Checkpoints, epochs: int) -> int:
-    """After how many epochs the profiler begins to trace; raises `ConfigError` if the run is too short for it."""
+    """After how many epochs the profiler begins to trace; raises `UserError` if the run is too short for it."""
     return profiling.plan(
         done=(checkpoints.steps() or [0])[-1] // program.env_steps_per_epoch,
         total=program.epochs,

@@ -23,12 +23,14 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 import envs  # noqa: E402
-import star.state  # noqa: E402
 from envs import opengl  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
-from star import episode, hierarchy, loading  # noqa: E402
+from star import loading  # noqa: E402
 from star import program as programs  # noqa: E402
+from star.agent import epoch as hierarchy
+from star.agent import play as episode  # noqa: E402
+from star.agent import state as states  # noqa: E402
 from star.checkpoint import Checkpoints  # noqa: E402
 from star.spec import Spec  # noqa: E402
 from tests.browser import program, started
@@ -219,7 +221,7 @@ def recording(request, breaking_env):
     agent, spec = parsed.agent(), Spec.of(breaking_env.env)
 
     def whole(key):
-        state = star.state.init(agent, spec, key=key)
+        state = states.init(agent, spec, key=key)
         # Greedy choices often fall on the goal's own region.
         eye = jnp.eye(state.abstraction.capacity)
         q = jnp.broadcast_to(eye, state.commander.q.shape)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import abstraction as regions
-from star.abstraction import Cut
+from star.abstraction import regions
+from star.abstraction.regions import Cut
 
 SPACE = ((-4.0, -4.0), (20.0, 20.0))
 

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import adjacency, loading
+from star import loading
+from star.agent import adjacency
 
 SPACE = ((-2.0, 0.0), (4.0, 3.5))  # 6 x 4 cells of side 1
 

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import assessment, checkpoint, cli, episode, loading, rendering, report, tables
+from star import assessment, checkpoint, cli, loading, rendering, report, tables
 from star import program as programs
+from star.agent import play as episode
+from star.agent.play import Episode
 from star.assessment import Exam, Target
 from star.checkpoint import Checkpoints, load_state
-from star.episode import Episode
 
 GRID = Exam(grid=2, seed=1)
 EPISODES = 5

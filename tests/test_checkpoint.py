@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.common.errors import UserError
 from star import checkpoint, migrations
+from star.agent.sections import Config
 from star.checkpoint import Checkpoints, Damaged, best, choose, kept, newest
-from star.config import Config, ConfigError
 from star.migrations import FORMAT, Migration, migrated_arrays
 from tests.small import unpacked
 
@@ -171,7 +172,7 @@ def test_a_checkpoint_that_cannot_be_written_is_told_in_one_line_and_leaves_no_t
         raise failure
 
     monkeypatch.setattr(checkpoint, "_sums", fail)
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         checkpoints.save(40, state(40), Config(), success=0.0)
     assert f"/40: cannot be written: {told}" in str(error.value) and "\n" not in str(error.value)
     monkeypatch.undo()
@@ -185,7 +186,8 @@ def test_a_full_disk_and_one_that_is_read_only_leave_older_checkpoints_and_whole
 import sys, subprocess, numpy as np
 from pathlib import Path
 from star.checkpoint import Checkpoints
-from star.config import Config, ConfigError
+from star.agent.sections import Config
+from envs.common.errors import UserError
 from star.lock import locked
 from star.metrics import JsonLines
 run = Path("disk/run")
@@ -194,7 +196,7 @@ checkpoints, lines = Checkpoints(run), JsonLines(run / "metrics.jsonl")
 def fails(action):
     try:
         action()
-    except ConfigError as error:
+    except UserError as error:
         print(error)
     checkpoints.check(10)
     assert checkpoints.steps() == [10] and all(row == {"env_steps": 1} for row in lines.read())
@@ -242,7 +244,7 @@ def test_a_checkpoint_of_another_version_says_which_can_be_read(checkpoints):
     ):
         path = folder(checkpoints, 20) / "about.json"
         path.write_text(json.dumps(json.loads(path.read_text()) | {"format": number}))
-        with pytest.raises(ConfigError, match=f"/20: checkpoint format {told}"):
+        with pytest.raises(UserError, match=f"/20: checkpoint format {told}"):
             checkpoints.config(20)
 
 

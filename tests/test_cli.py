@@ -9,9 +9,10 @@ import jax
 import pytest
 
 import envs
+from envs.common.errors import UserError
 from star import assessment, tables, trainer
+from star.agent.sections import Config
 from star.cli import main, split_settings
-from star.config import Config, ConfigError
 from star.loading import fields
 
 ROOT = Path(__file__).parents[1]
@@ -413,7 +414,7 @@ def test_what_is_no_setting_is_left_to_the_command(arguments):
 
 
 def test_a_setting_without_a_value_is_refused():
-    with pytest.raises(ConfigError, match="needs a value"):
+    with pytest.raises(UserError, match="needs a value"):
         split_settings(["--a.b"])
 
 

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import commander, loading
-from star.commander import CommanderState, Decision, Model, Successors
+from star import loading
+from star.agent import commander
+from star.agent.commander import CommanderState, Decision, Model, Successors
 
 R, N = 5, 40
 

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import pytest
 from pydantic import ValidationError
 
-from star.config import Config, ConfigError
+from envs.common.errors import UserError
+from star.agent.sections import Config
 from star.loading import fields, load, parse
 
 DEFAULTS = {key: default for key, default, _ in fields()}
@@ -24,8 +25,8 @@ def write(tmp_path):
 
 
 def refusal(*args, **kwargs):
-    """The message of the ConfigError that `load` raises; always one line."""
-    with pytest.raises(ConfigError) as caught:
+    """The message of the UserError that `load` raises; always one line."""
+    with pytest.raises(UserError) as caught:
         load(*args, **kwargs)
     message = str(caught.value)
     assert "\n" not in message
@@ -131,7 +132,7 @@ def test_numbers_must_be_finite(write, key, value):
 @pytest.mark.parametrize("key", ["trainer.num_envs", "trainer.seed", "tutor.reward_scale", "refinement.depth"])
 @pytest.mark.parametrize("value", [True, False])
 def test_booleans_are_not_numbers(key, value):
-    with pytest.raises(ConfigError, match=rf"{key}: {str(value).lower()} is not allowed: should be a number"):
+    with pytest.raises(UserError, match=rf"{key}: {str(value).lower()} is not allowed: should be a number"):
         parse({}, {key: value})
 
 
@@ -144,7 +145,7 @@ def test_booleans_are_not_numbers(key, value):
     ],
 )
 def test_values_that_do_not_fit_together_are_refused(values, key):
-    with pytest.raises(ConfigError, match=key):
+    with pytest.raises(UserError, match=key):
         parse(values)
 
 
@@ -258,7 +259,7 @@ def test_what_is_no_regular_file_is_not_read(path):
     ],
 )
 def test_whole_numbers_beyond_all_use_are_refused(key, value):
-    with pytest.raises(ConfigError, match=rf"{key}(\.0)?: .* is not allowed: .*(less than|at most)"):
+    with pytest.raises(UserError, match=rf"{key}(\.0)?: .* is not allowed: .*(less than|at most)"):
         parse({}, {key: value})
 
 
@@ -283,7 +284,7 @@ def test_overrides_leave_the_values_they_were_given_alone():
 
 
 def test_a_misspelt_override_names_the_nearest_key():
-    with pytest.raises(ConfigError, match=r"tutor.ppo.clp: unknown key \(did you mean tutor.ppo.clip\?\)"):
+    with pytest.raises(UserError, match=r"tutor.ppo.clp: unknown key \(did you mean tutor.ppo.clip\?\)"):
         parse({}, {"tutor.ppo.clp": 1})
 
 
@@ -384,7 +385,7 @@ def test_layers_replace_only_what_they_name_and_another_task_brings_its_own_opti
 def test_an_error_names_all_files_it_may_come_from(write, tmp_path):
     layer = tmp_path / "layer.yaml"
     layer.write_text("tutor: {unrol: 3}")
-    with pytest.raises(ConfigError, match=r"maze.yaml with .*layer.yaml: tutor.unrol: unknown key"):
+    with pytest.raises(UserError, match=r"maze.yaml with .*layer.yaml: tutor.unrol: unknown key"):
         load(write("tutor: {unroll: 2}"), layers=[layer])
 
 
@@ -404,7 +405,7 @@ def test_every_shipped_layer_fits_every_shipped_config(pytestconfig, folder):
 
 
 def test_a_number_that_float32_cannot_hold_is_refused():
-    with pytest.raises(ConfigError, match=r": tutor.reward_scale: 1e\+300 is not allowed: should lie between"):
+    with pytest.raises(UserError, match=r": tutor.reward_scale: 1e\+300 is not allowed: should lie between"):
         parse({}, {"tutor.reward_scale": 1e300})
     assert parse({}, {"tutor.reward_scale": 1e38}).tutor.reward_scale == 1e38
 
@@ -412,5 +413,5 @@ def test_a_number_that_float32_cannot_hold_is_refused():
 def test_hold_has_three_values():
     for value in (False, True, "region"):
         assert parse({}, {"commander.hold": value}).commander.hold is value
-    with pytest.raises(ConfigError, match=r"commander.hold: 'goal' is not allowed: should be false, true or 'region'$"):
+    with pytest.raises(UserError, match=r"commander.hold: 'goal' is not allowed: should be false, true or 'region'$"):
         parse({}, {"commander.hold": "goal"})

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import envs
-from star import controller, loading, state
+from star import loading
+from star.agent import controller, state
 from star.spec import Spec
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from envs.common.errors import UserError
 from star import cli, devices
-from star.config import ConfigError
 from star.loading import parse
 from tests.small import RUN
 
@@ -17,10 +17,11 @@ ROOT = Path(__file__).parents[1]
 
 REPLAY = """
 import jax, jax.numpy as jnp, numpy as np
-from envs.batching import flattened, shared_out
-from star import devices, td3
-from star.config import TD3Config
-from star.replay import Transition
+from envs.common.batching import flattened, shared_out
+from star import devices
+from star.learners import td3
+from star.learners.replay import Transition
+from star.learners.sections import TD3Config
 
 config = TD3Config(hidden=(8,), batch_size=16, buffer_size=64, updates_per_rollout=2, min_transitions=16)
 zero, number = jnp.zeros(()), lambda *shape: jax.random.normal(jax.random.key(len(shape)), shape)
@@ -72,7 +73,7 @@ from envs import VectorEnv, make
 from envs.physics import Physics
 from star import devices
 from star.checkpoint import Checkpoints
-from star.config import Config
+from star.agent.sections import Config
 from star.metrics import Journal
 
 address, number, folder = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
@@ -160,13 +161,13 @@ def test_two_processes_step_one_batch_and_the_first_alone_writes(tmp_path):
     ],
 )
 def test_devices_must_share_evenly(settings, line):
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         parse(RUN, settings)
     assert str(error.value).endswith(line)
 
 
 def test_devices_that_are_not_there_are_refused_in_one_line():
-    with pytest.raises(ConfigError, match=r"^trainer.devices: 4 are not available, JAX sees 1 \(cpu\); allowed: 1$"):
+    with pytest.raises(UserError, match=r"^trainer.devices: 4 are not available, JAX sees 1 \(cpu\); allowed: 1$"):
         devices.mesh(4)
 
 

@@ -15,8 +15,8 @@ from envs import opengl
 from envs.tasks import TASKS
 from star import assessment, cli, record, rendering, sweep, tables, trainer
 from star import program as programs
+from star.agent.sections import Config
 from star.cli import main
-from star.config import Config
 from star.loading import fields, load, parse
 
 ENDLESS = {"total_env_steps": 2**62}

@@ -9,9 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import envs
-import star.state
-from star import abstraction as regions
-from star import episode, loading
+from star import loading
+from star.abstraction import regions
+from star.agent import play as episode
+from star.agent import state as states
 from star.spec import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and the environments of the recording
@@ -238,7 +239,7 @@ def test_subgoals_with_a_heading_stay_where_they_are_while_the_agent_moves_and_t
     agent = loading.parse(tiny).agent()
 
     def rolled(key):
-        state = star.state.init(agent, spec, key=key)
+        state = states.init(agent, spec, key=key)
         streams = episode.start(spec, breaking_env, key=key)
         subgoal = jax.random.normal(key, (B, 4))
         return episode.rollout(agent, spec, breaking_env, state, streams, subgoal, deterministic=False, key=key)[1]
@@ -257,7 +258,7 @@ def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_e
     spec = Spec.of(breaking_env.env)
 
     def commanded(key):
-        state = star.state.init(agent, spec, key=key)
+        state = states.init(agent, spec, key=key)
         away = jnp.zeros_like(state.commander.q).at[..., 2].set(1.0)  # everybody is sent to region 2
         state = state.replace(commander=state.commander.replace(q=away))
         streams = episode.start(spec, breaking_env, key=key)
@@ -285,7 +286,7 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
     spec = replace(Spec.of(breaking_env.env), episode_length=7 * L)
 
     def played(key):
-        state = star.state.init(agent, spec, key=key)
+        state = states.init(agent, spec, key=key)
         stay = jnp.broadcast_to(jnp.eye(state.abstraction.capacity)[:, None], state.commander.q.shape)
         monkeypatch.setattr(episode, "settled", lambda *_, **__: state.commander.replace(q=stay))
         look = lambda env_state, subgoal, box, action: (spec.abstract(env_state.obs), box)  # noqa: E731
@@ -310,7 +311,7 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
 
 def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
     agent = loading.parse(tiny).agent()
-    state = star.state.init(agent, Spec.of(breaking_env.env), key=jax.random.key(0))
+    state = states.init(agent, Spec.of(breaking_env.env), key=jax.random.key(0))
     short, one = (episode.settled(agent, state, episode_length=steps).q for steps in (K - L, K))
     assert np.asarray(one).any()
     np.testing.assert_array_equal(short, one)
@@ -320,7 +321,7 @@ def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
 def test_who_comes_back_to_a_region_makes_less_of_what_it_was_told_there(breaking_env, tiny, retry):
     agent = loading.parse(tiny, {"commander.retry": retry, "commander.hold": False}).agent()
     spec = replace(Spec.of(breaking_env.env), episode_length=40 * L)
-    state = star.state.init(agent, spec, key=jax.random.key(0))
+    state = states.init(agent, spec, key=jax.random.key(0))
     n, rng = int(state.abstraction.count), np.random.default_rng(0)
     q = rng.uniform(-1, 1, state.commander.q.shape).astype(np.float32)
     state = state.replace(commander=state.commander.replace(q=jnp.asarray(q)))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from star import evaluation
-from star.episode import Episode
+from star.agent.play import Episode
 from star.evaluation import TAUS, Trials
 
 GROUP = {"maze": [0.1, 0.9, 0.4, 0.4], "rooms": [0.0, 1.0, 0.7]}

@@ -15,10 +15,11 @@ from jaxtyping import Array, Float, TypeCheckError, jaxtyped
 from rich.console import Console
 
 import envs
-import star.state
-from star import checkpoint, cli, debugging, faults, hierarchy, trainer
+from star import checkpoint, cli, debugging, faults, trainer
 from star import program as programs
-from star.episode import Episode
+from star.agent import epoch as hierarchy
+from star.agent import state as states
+from star.agent.play import Episode
 from star.loading import parse
 from star.metrics import Journal, of_epoch
 from star.program import Functions
@@ -54,7 +55,7 @@ def epoch():
     env = envs.make("point_maze", engine="jax", episode_length=60)
     agent, spec = ALL_LEVELS.agent(), Spec.of(env)
     batch = Fragile(env, ALL_LEVELS.trainer.num_envs, auto_reset=False)
-    init = jax.jit(jax.vmap(lambda key: star.state.init(agent, spec, key=key)))
+    init = jax.jit(jax.vmap(lambda key: states.init(agent, spec, key=key)))
     one = jax.jit(jax.vmap(lambda state: hierarchy.epoch(agent, spec, batch, state, teachers=())))
     fresh, _ = one(init(jax.random.split(jax.random.key(0), len(SEEDS))))  # with something in its rings
 
@@ -312,10 +313,11 @@ from star import debugging
 debugging.turn_on()
 import jax
 assert jax.config.jax_debug_nans
-from star import forward_model, hierarchy, program
+from star import program
+from star.agent import epoch
 from star.loading import parse
 from tests.small import RUN
-assert hasattr(hierarchy.refine, "__wrapped__")
+assert hasattr(epoch.refine, "__wrapped__")
 built = program.build(parse(RUN))
 state = jax.eval_shape(built.init, built.seed_keys())
 jax.eval_shape(built.epoch, state)

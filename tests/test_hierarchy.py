@@ -7,11 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import star.state
-from star import hierarchy, loading, refinement, replay
-from star.commander import Decision
-from star.forward_model import Outcome
-from star.replay import Transition
+from star import loading
+from star.abstraction import refinement
+from star.abstraction.forward_model import Outcome
+from star.agent import epoch as hierarchy
+from star.agent import state as states
+from star.agent.commander import Decision
+from star.learners import replay
+from star.learners.replay import Transition
 from star.spec import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and trainer.num_envs of the tiny hierarchy
@@ -161,7 +164,7 @@ class Epoch:
             return hierarchy.epoch(agent, self.spec, env, state)
 
         self.one = jax.jit(once)
-        self.init = jax.jit(lambda key: star.state.init(self.config.agent(), self.spec, key=key))
+        self.init = jax.jit(lambda key: states.init(self.config.agent(), self.spec, key=key))
 
 
 @pytest.fixture(scope="module")
@@ -296,7 +299,7 @@ def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tin
     if "." in section:
         overrides[f"{section.split('.')[0]}.learner"] = "td3"
     with pytest.raises(ValueError) as caught:
-        star.state.check(loading.parse(tiny, overrides), Spec.of(breaking_env.env))
+        states.check(loading.parse(tiny, overrides), Spec.of(breaking_env.env))
     assert section in str(caught.value) and "batch_size" in str(caught.value) and "\n" not in str(caught.value)
 
 

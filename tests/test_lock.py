@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from star.config import ConfigError
+from envs.common.errors import UserError
 from star.lock import locked
 
 
@@ -14,7 +14,7 @@ def unexpected(line):
 
 def test_a_run_directory_in_use_is_refused_with_the_name_of_who_uses_it(tmp_path):
     with locked(tmp_path, warn=unexpected):
-        with pytest.raises(ConfigError, match=f"^{tmp_path}: is in use by process {os.getpid()} on "):
+        with pytest.raises(UserError, match=f"^{tmp_path}: is in use by process {os.getpid()} on "):
             with locked(tmp_path, warn=unexpected):
                 raise AssertionError
     with locked(tmp_path, warn=unexpected):
@@ -33,7 +33,7 @@ def test_a_file_system_that_cannot_lock_is_told_of_and_used_all_the_same(tmp_pat
 
 
 def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):
-    with pytest.raises(ConfigError, match="none: cannot be written: No such file or directory"):
+    with pytest.raises(UserError, match="none: cannot be written: No such file or directory"):
         with locked(tmp_path / "none", warn=unexpected):
             raise AssertionError
 
@@ -42,6 +42,6 @@ def test_a_refusal_leaves_no_lock_behind(tmp_path):
     for kept in (False, True):
         if kept:
             (tmp_path / ".lock").touch()
-        with pytest.raises(ConfigError, match="no"), locked(tmp_path, warn=unexpected):
-            raise ConfigError("no")
+        with pytest.raises(UserError, match="no"), locked(tmp_path, warn=unexpected):
+            raise UserError("no")
         assert (tmp_path / ".lock").exists() == kept

@@ -1,8 +1,8 @@
 import pytest
 
+from envs.common.errors import UserError
 from star import memory, trainer
 from star import program as programs
-from star.config import ConfigError
 from star.loading import parse
 from tests.small import RUN
 
@@ -33,7 +33,7 @@ def test_a_larger_buffer_needs_as_many_more_transitions():
 )
 def test_a_run_that_cannot_fit_is_refused_before_anything_is_written(tmp_path, overrides):
     with pytest.raises(
-        ConfigError, match=r"needs at least [\d,.]+ GiB of memory, .* for .*controller.*; there are"
+        UserError, match=r"needs at least [\d,.]+ GiB of memory, .* for .*controller.*; there are"
     ) as caught:
         trainer.train(parse(RUN, overrides), tmp_path / "run", quiet=True)
     assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from star.networks import MLP, Normalizer, apply
+from star.learners.networks import MLP, Normalizer, apply
 
 
 def test_an_mlp_is_affine_maps_with_an_activation_between():

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from envs.common.errors import UserError
 from star import history, page, report
 from star.cli import main
-from star.config import ConfigError
 from star.loading import load, parse
 
 CUTS = [0.0, 8.0, 12.0, 16.0]
@@ -224,7 +224,7 @@ def test_seeds_that_went_on_with_other_settings_are_not_those_of_one_run(make):
     assert [(row["env_steps"], row["key"]) for row in history.changes(both)] == [(200, "trainer.total_env_steps")]
     assert "trainer.seed" not in page.facts(both)["command"]
     other = read(alone(make, "other", 2, resumed=[(200, BOTH)]))
-    with pytest.raises(ConfigError, match="differ in commander.practice; "):
+    with pytest.raises(UserError, match="differ in commander.practice; "):
         history.together("all", [both, other])
 
 
@@ -323,7 +323,7 @@ START = '{"env_steps": 0, "time": "", "device": "", "python": "", "versions": {}
 def test_a_file_that_no_run_writes_is_refused_in_one_line_that_says_where(make, name, text, said):
     folder = make("run")
     (folder / f"{name}.jsonl").write_text(text, encoding="latin-1")
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         read(folder)
     assert said in str(error.value) and "\n" not in str(error.value)
 

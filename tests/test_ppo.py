@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading, ppo
-from star.replay import Transition
+from star import loading
+from star.learners import ppo
+from star.learners.replay import Transition
 
 T, B = 6, 8
 

@@ -1,7 +1,7 @@
 import jax
 import pytest
 
-from star.config import ConfigError
+from envs.common.errors import UserError
 from star.profiling import Profile, plan
 
 
@@ -24,7 +24,7 @@ def test_a_trace_begins_where_nothing_compiles_any_more(done, eval_every, epochs
 
 @pytest.mark.parametrize(("done", "eval_every", "epochs"), [(0, 5, 20), (19, 5, 1), (20, 5, 1), (15, 18, 4)])
 def test_a_run_too_short_for_the_trace_is_refused(done, eval_every, epochs):
-    with pytest.raises(ConfigError, match=f"^--profile: {epochs} epochs cannot be traced .* {20 - done} are left"):
+    with pytest.raises(UserError, match=f"^--profile: {epochs} epochs cannot be traced .* {20 - done} are left"):
         plan(done=done, total=20, eval_every=eval_every, epochs=epochs)
 
 

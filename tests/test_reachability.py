@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import reachability
-from star.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves, Network
+from star.abstraction import reachability
+from star.abstraction.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves, Network
 
 DEPTH = 5
 

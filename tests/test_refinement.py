@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import abstraction as regions
-from star import forward_model, loading, refinement, replay
-from star.abstraction import Cut
-from star.forward_model import Outcome
-from star.reachability import MISSES, REACHES, UNKNOWN, Leaves
-from star.refinement import Goals, Graph, Split
+from star import loading
+from star.abstraction import forward_model, refinement, regions
+from star.abstraction.forward_model import Outcome
+from star.abstraction.reachability import MISSES, REACHES, UNKNOWN, Leaves
+from star.abstraction.refinement import Goals, Graph, Split
+from star.abstraction.regions import Cut
+from star.learners import replay
 
 R = 6
 SPACE = ((-4.0, -4.0), (20.0, 20.0))

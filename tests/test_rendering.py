@@ -14,9 +14,9 @@ from PIL import Image
 
 import envs
 from envs import EnvError, opengl
+from envs.common.errors import UserError
 from star import assessment, cli, rendering
 from star.assessment import Exam, Target
-from star.config import ConfigError
 from star.loading import load, parse
 from star.rendering import Moments, Show
 
@@ -212,7 +212,7 @@ def test_a_broken_driver_does_not_end_in_a_traceback(tmp_path):
 
 
 def test_an_error_while_recording_becomes_one_of_the_configuration(tmp_path):
-    with pytest.raises(ConfigError, match="unknown"):
+    with pytest.raises(UserError, match="unknown"):
         rendering.render(parse({"env": {"name": "nowhere"}}), Show(out=tmp_path / "a.png"), quiet=True)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import replay
+from star.learners import replay
 
 SIZE = 7
 

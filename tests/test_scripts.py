@@ -15,16 +15,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import star.state
 from envs.arena import Arena
-from star import loading, reachability, replay
+from star import loading
 from star import program as programs
+from star.abstraction import reachability
+from star.abstraction.forward_model import Outcome
+from star.abstraction.reachability import MISSES, REACHES
+from star.agent import state as states
+from star.agent.commander import Decision
 from star.checkpoint import Checkpoints, Damaged
-from star.commander import Decision
 from star.evaluation import bootstrap
-from star.forward_model import Outcome
+from star.learners import replay
 from star.metrics import JsonLines
-from star.reachability import MISSES, REACHES
 from star.spec import Spec
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
@@ -210,7 +212,7 @@ def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
     script = load("verify_abstraction")
     spec = Spec.of(breaking_env.env)
     agent = loading.parse(tiny, {"abstraction.cuts": [[8.0], [8.0]]}).agent()
-    state = star.state.init(agent, spec, key=jax.random.key(0))
+    state = states.init(agent, spec, key=jax.random.key(0))
     verdict = state.graph.verdict.at[0, 1].set(REACHES).at[1, 0].set(MISSES)
     state = state.replace(graph=state.graph.replace(verdict=verdict))
     # (region, target, next region): 0 -> 1 is right in 3 of 4 rollouts, 1 -> 0 in 1 of 2, and one does not count.
@@ -264,7 +266,7 @@ def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_
     agent = loading.parse(
         tiny, {"abstraction.cuts": [[8.0], [8.0]], "refinement.parts": 8, "refinement.depth": 3}
     ).agent()
-    state = star.state.init(agent, spec, key=jax.random.key(0))
+    state = states.init(agent, spec, key=jax.random.key(0))
     layer = state.forward_model.params["params"]["Dense_1"]
     moving = {"kernel": 0.1 * layer["kernel"], "bias": jax.numpy.array([1.0, 0.0])}
     params = {"params": {**state.forward_model.params["params"], "Dense_1": moving}}

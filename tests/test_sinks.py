@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 from tensorboardX.proto.event_pb2 import Event
 
+from envs.common.errors import UserError
 from star import sinks
-from star.config import ConfigError
 from star.loading import parse
 from star.sinks import Sinks, TensorBoard, WandB, Worker
 
@@ -198,6 +198,6 @@ def test_a_sink_that_hangs_holds_up_neither_the_training_nor_its_end(monkeypatch
 
 def test_a_package_that_is_not_installed_is_named_with_what_to_install(monkeypatch):
     monkeypatch.setattr(sinks.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r'^trainer.sinks: wandb is not installed; .* "star-rl\[wandb\]"$'):
+    with pytest.raises(UserError, match=r'^trainer.sinks: wandb is not installed; .* "star-rl\[wandb\]"$'):
         sinks.check(settings("tensorboard", "wandb"))
     sinks.check(settings("tensorboard"))

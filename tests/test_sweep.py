@@ -27,9 +27,9 @@ from optuna._transform import _SearchSpaceTransform
 from optuna.distributions import FloatDistribution, IntDistribution
 from rich.console import Console
 
+from envs.common.errors import UserError
 from star import cli, sweep, sweep_report
 from star import program as programs
-from star.config import ConfigError
 from star.loading import fields, kind, load, parse
 from star.study import Cmaes, Ledger, reason
 from star.sweep import open_ledger, plan, work
@@ -120,7 +120,7 @@ def test_every_float_of_the_agent_may_differ_side_by_side_and_nothing_else():
             values = base.model_dump(mode="json")
             for part in key.split(".")[:-1]:
                 values = values[part]
-            with contextlib.suppress(ConfigError):  # some need others
+            with contextlib.suppress(UserError):  # some need others
                 flipped = parse(RUN, {key: not values[key.split(".")[-1]]})
                 assert programs.structure(flipped) != programs.structure(base), key
     assert programs.structure(parse(RUN, {"trainer.seed": 7})) == programs.structure(base)
@@ -334,10 +334,10 @@ def test_a_place_that_cannot_be_used_is_one_line_and_nothing_is_written(folder, 
 def test_the_study_of_another_sweep_is_refused(folder):
     finished(written())
     other = plan(written(), settings={"tutor.reward_scale": 0.7})
-    with pytest.raises(ConfigError, match=r"study three: is of another sweep, with settings.tutor.reward_scale 0.3"):
+    with pytest.raises(UserError, match=r"study three: is of another sweep, with settings.tutor.reward_scale 0.3"):
         open_ledger(other, "sqlite:///out/sweep.db")
     before = {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
-    with pytest.raises(ConfigError, match="out: holds the results of the sweep three; choose another --out"):
+    with pytest.raises(UserError, match="out: holds the results of the sweep three; choose another --out"):
         sweep.run(plan(written(study="four")), Path("out"), quiet=True)
     assert {path: path.read_bytes() for path in before} == before
 

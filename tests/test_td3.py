@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading, replay, td3
-from star.replay import Transition
+from star import loading
+from star.learners import replay, td3
+from star.learners.replay import Transition
 
 
 def settings(**values):

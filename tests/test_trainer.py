@@ -22,10 +22,10 @@ import pytest
 import yaml
 
 import envs
+from envs.common.errors import UserError
 from star import checkpoint, cli, provenance, report, starting, stopping, stretch, trainer
 from star import program as programs
 from star.checkpoint import Checkpoints, check_compatible
-from star.config import ConfigError
 from star.loading import load, parse
 from star.lock import locked
 from star.metrics import Journal, JsonLines
@@ -172,7 +172,7 @@ def test_two_runs_of_one_config_and_seed_write_the_same_metrics(finished, tmp_pa
 
 
 def test_a_trace_longer_than_the_run_is_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(ConfigError, match="^--profile: 4 epochs cannot be traced .*: 4 are left"):
+    with pytest.raises(UserError, match="^--profile: 4 epochs cannot be traced .*: 4 are left"):
         trainer.train(tiny(), tmp_path / "run", quiet=True, profile=4)
     assert not (tmp_path / "run").exists()
 
@@ -241,7 +241,7 @@ def test_a_run_killed_before_its_first_checkpoint_begins_anew(finished, tmp_path
     os.truncate(part / "metrics.jsonl", (part / "metrics.jsonl").stat().st_size // 2)
     with (part / "provenance.jsonl").open("a") as file:
         file.write('{"env_steps": 0, "half a li')
-    with pytest.raises(ConfigError, match="part: was begun with trainer.num_envs 4, not 8"):
+    with pytest.raises(UserError, match="part: was begun with trainer.num_envs 4, not 8"):
         trainer.train(tiny(trainer__num_envs=8), part, resume=True, quiet=True)
     trainer.train(load(part / "config.yaml"), part, resume=True, quiet=True)
     assert capsys.readouterr().err == f"warning: {part}: holds no checkpoint, so it begins anew\n"
@@ -257,7 +257,7 @@ def test_what_a_run_killed_at_once_left_does_not_keep_another_from_beginning(tmp
         (tmp_path / name).touch()
     starting.make(tmp_path)
     (tmp_path / "config.yaml").touch()
-    with pytest.raises(ConfigError, match="is not empty"):
+    with pytest.raises(UserError, match="is not empty"):
         starting.make(tmp_path)
 
 
@@ -266,7 +266,7 @@ def test_a_second_process_is_refused_and_changes_nothing(finished):
     before = {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()}
     with locked(run_dir, warn=print):
         held = (run_dir / ".lock").read_bytes()
-        with pytest.raises(ConfigError, match="is in use by process"):
+        with pytest.raises(UserError, match="is in use by process"):
             trainer.train(tiny(), run_dir, resume=True, quiet=True)
     assert {path: path.read_bytes() for path in run_dir.rglob("*") if path.is_file()} == before | {
         run_dir / ".lock": held
@@ -278,7 +278,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_one_line_and_it_resumes(finished, 
     part = tmp_path / "part"
     with monkeypatch.context() as patch:
         patch.setattr(checkpoint, "_sums", fail_after(checkpoint._sums, 1, OSError(28, "No space left on device")))
-        with pytest.raises(ConfigError, match=f"{4 * EPOCH}: cannot be written: No space left on device; earlier"):
+        with pytest.raises(UserError, match=f"{4 * EPOCH}: cannot be written: No space left on device; earlier"):
             trainer.train(tiny(), part, quiet=True)
     assert Checkpoints(part).steps() == [2 * EPOCH] and rows(part) == rows(run_dir)
     trainer.train(tiny(), part, resume=True, quiet=True)
@@ -318,7 +318,7 @@ def test_what_sgim_has_chosen_is_written_down(finished):
 def test_a_teacher_who_cannot_teach_is_refused_before_anything_is_written(tmp_path, monkeypatch, teacher, told):
     monkeypatch.chdir(tmp_path)
     teachers.save(Path("routes.npz"), teachers.shortest_paths(envs.make("point_maze")), env="point_maze")
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         trainer.train(tiny(sgim__teachers=[{"name": "helper", **teacher}]), tmp_path / "run", quiet=True)
     assert str(error.value).startswith(told) and "\n" not in str(error.value)
     assert not (tmp_path / "run").exists()
@@ -360,7 +360,7 @@ def test_neither_the_length_of_training_episodes_nor_what_was_planned_before_cha
     found = one.evaluate(fresh, one.evaluation_keys(0))
     for program, state in ((other, shorter_fresh), (one, before)):
         jax.tree.map(np.testing.assert_array_equal, found, program.evaluate(state, one.evaluation_keys(0)))
-    with pytest.raises(ConfigError, match="tutor.period: 10 does not divide the test episode of 55"):
+    with pytest.raises(UserError, match="tutor.period: 10 does not divide the test episode of 55"):
         programs.build(parse(RUN, shorter | {"env.options.episode_length": 55}))
 
 
@@ -404,7 +404,7 @@ def test_evaluation_of_a_checkpoint_that_is_not_there_names_those_that_are(finis
 def test_a_checkpoint_of_another_shape_or_environment_is_refused(finished, override, named):
     run_dir, _ = finished
     before = (run_dir / "metrics.jsonl").read_bytes()
-    with pytest.raises(ConfigError, match="its checkpoint was made with") as error:
+    with pytest.raises(UserError, match="its checkpoint was made with") as error:
         trainer.train(tiny(**override), run_dir, resume=True, quiet=True)
     assert named in str(error.value) and "\n" not in str(error.value)
     assert (run_dir / "metrics.jsonl").read_bytes() == before
@@ -445,7 +445,7 @@ def test_a_checkpoint_loads_on_a_machine_without_the_device_it_was_saved_on(tmp_
 import sys, jax, jax.numpy as jnp
 from pathlib import Path
 from star.checkpoint import Checkpoints, check_compatible
-from star.config import Config
+from star.agent.sections import Config
 state = {"x": jax.device_put(jnp.arange(3.0), jax.devices()[1])}
 checkpoints = Checkpoints(Path(sys.argv[1]))
 checkpoints.save(7, state, Config(), success=0.0)
@@ -607,6 +607,6 @@ def test_a_checkout_that_is_not_installed_says_where_it_runs_all_the_same(monkey
 
 def test_another_config_than_that_of_the_folder_is_refused_before_anything_is_written(tmp_path):
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(TINY), encoding="utf-8")
-    with pytest.raises(ConfigError, match="was begun with trainer.num_envs"):
+    with pytest.raises(UserError, match="was begun with trainer.num_envs"):
         trainer.train(tiny(trainer__num_envs=6), tmp_path, resume=True, quiet=True)
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading, tutor
-from star.replay import Transition
-from star.tutor import Box, Trace
+from star import loading
+from star.agent import tutor
+from star.agent.tutor import Box, Trace
+from star.learners.replay import Transition
 
 N, L = 6, 4
 SCALE = np.array([10.0, 5.0], np.float32)

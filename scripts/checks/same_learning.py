@@ -87,9 +87,11 @@ SMALL: dict[str, Any] = {
     "forward_model.updates_per_epoch": 4,
     "refinement.min_transitions": 1,
     "refinement.min_visits": 1,
-    "refinement.depth": 3,
-    "refinement.pairs_per_epoch": 4,
+    "refinement.depth": 5,
+    "refinement.pairs_per_epoch": 16,
     "refinement.error_tolerance": 0.9,
+    "refinement.reach_share": 0.2,
+    "abstraction.min_width": 0.01,
     "trainer.num_envs": 8,
     "trainer.eval_every": 1,
     "trainer.eval_episodes": 4,
@@ -104,9 +106,8 @@ SMALL_TD3: dict[str, Any] = {
         "hidden": [8], "batch_size": 16, "buffer_size": 512, "min_transitions": 16, "updates_per_rollout": 2
     }.items()
 }  # fmt: skip
-CUTS = {"abstraction.cuts": [[-0.2, 0.0, 0.2], [-0.2, 0.0, 0.2]], "abstraction.min_width": 0.01}
 EPISODE = 60  # env steps
-POINT: dict[str, Any] = SMALL | CUTS | {"env.options.episode_length": EPISODE}
+POINT: dict[str, Any] = SMALL | {"env.options.episode_length": EPISODE}
 ANT: dict[str, Any] = POINT | {"env.engine": "native", "tutor.unroll": 3}
 ADJACENCY: dict[str, Any] = {
     f"tutor.adjacency.{key}": value
@@ -134,8 +135,8 @@ ROWS: dict[str, Row] = {
     "ablations/no_mask": Row(),
     "ablations/no_practice": Row(),
     "ablations/no_refinement": Row(),
-    "ablations/one_box": Row(settings={key: x for key, x in POINT.items() if key not in CUTS}),
-    "ablations/one_box_goals": Row(settings={k: x for k, x in POINT.items() if k != "abstraction.max_regions"}),
+    "ablations/one_box": Row(),
+    "ablations/one_box_goals": Row(),
     "ablations/one_box_goals_unrefined": Row(),
     "ablations/one_box_unrefined": Row(),
     "ablations/published": Row("ant_maze_cpu", ANT | SMALL_TD3 | {"refinement.parts": 8}),

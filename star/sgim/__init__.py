@@ -6,21 +6,30 @@
     state = sgim.update(config, state, choice, competences)  # [N]
 
 Source: S. M. Nguyen, habilitation thesis; SGIM-ACTS (Nguyen and Oudeyer 2012), SGIM-PB (Duminy, Nguyen, Duhaut 2021).
+
+What needs JAX is imported when it is first used.
 """
 
-from star.config import SelectionConfig as Config
-from star.sgim.selection import (
-    Choice,
-    SgimState,
-    init,
-    interest,
-    on_split,
-    probabilities,
-    progress,
-    select,
-    split,
-    update,
-)
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from star.sgim.sections import SelectionConfig as Config
+
+if TYPE_CHECKING:
+    from star.sgim.selection import (
+        Choice,
+        SgimState,
+        init,
+        interest,
+        on_split,
+        probabilities,
+        progress,
+        select,
+        split,
+        update,
+    )
 
 __all__ = [
     "Choice",
@@ -35,3 +44,11 @@ __all__ = [
     "split",
     "update",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'star.sgim' has no attribute {name!r}")
+    value = getattr(importlib.import_module("star.sgim.selection"), name)
+    globals()[name] = value
+    return value

@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from star.abstraction import Abstraction, create
+from star.abstraction.regions import Abstraction, create
 from star.sgim.selectors import Selector
 
 

@@ -33,10 +33,10 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from envs.batching import where
-from star import abstraction as regions
-from star.abstraction import Abstraction, Cut
-from star.config import SelectionConfig
+from envs.common.batching import where
+from star.abstraction import regions
+from star.abstraction.regions import Abstraction, Cut
+from star.sgim.sections import SelectionConfig
 
 RANDOM, INTEREST, BEST = 0, 1, 2  # modes of a choice
 QUANTILES = 9  # places where a cut is tried along each dimension

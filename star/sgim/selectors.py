@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from star.abstraction import Abstraction, locate
-from star.config import SelectionConfig
+from star.abstraction.regions import Abstraction, locate
 from star.sgim import mixtures, selection
 from star.sgim.mixtures import Mixture
+from star.sgim.sections import SelectionConfig
 from star.sgim.selection import Choice, SgimState
 
 HISTORY = 256  # increments whose quantiles rescale the rewards of Exp3 and Exp4

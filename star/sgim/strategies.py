@@ -23,10 +23,10 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from star import abstraction as regions
-from star.abstraction import Abstraction
-from star.config import SgimConfig
+from star.abstraction import regions
+from star.abstraction.regions import Abstraction
 from star.sgim import selection
+from star.sgim.sections import SgimConfig
 from star.sgim.selection import Choice, SgimState
 from star.sgim.teachers import Demonstrations, nearest
 

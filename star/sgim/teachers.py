@@ -32,10 +32,12 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from envs import EnvError, files, reading, routes
+from envs import routes
 from envs.arena import FREE, GOAL, ROBOT
-from star.config import ConfigError
-from star.loading import nearest_file
+from envs.common import files, reading
+from envs.common.errors import UserError
+from envs.common.files import nearest_file
+from star.config.section import ConfigError
 from star.spec import Spec
 
 FORMAT = 1  # of files
@@ -134,31 +136,25 @@ def save(path: Path, demos: Demonstrations, *, env: str, force: bool = False) ->
     """Write demonstrations in the task named `env`; an existing file is replaced only with `force`.
 
     Raises:
-      ConfigError: in one line, if it cannot be written.
+      UserError: in one line, if it cannot be written.
     """
     check_place(path, force=force)
     arrays: dict[str, Any] = {"format": FORMAT, "env": env}
     arrays |= {name: np.asarray(value) for name, value in vars(demos).items() if value is not None}
-    try:
-        with files.whole(path) as partial:
-            np.savez_compressed(partial, **arrays)
-    except EnvError as error:
-        raise ConfigError(str(error)) from None
+    with files.whole(path) as partial:
+        np.savez_compressed(partial, **arrays)
 
 
 def check_place(path: Path, *, force: bool = False) -> None:
-    """Raise `ConfigError` in one line if `save` could not write `path`, or would replace it without `force`."""
-    try:
-        files.check(path, ENDINGS, force=force)
-    except EnvError as error:
-        raise ConfigError(str(error)) from None
+    """Raise `UserError` in one line if `save` could not write `path`, or would replace it without `force`."""
+    files.check(path, ENDINGS, force=force)
 
 
 def load(path: Path, *, env: str, spec: Spec) -> Demonstrations:
     """Read demonstrations for the task named `env`.
 
     Raises:
-      ConfigError: in one line, if there is no such file, or it is malformed, or made for something else.
+      UserError: in one line, if there is no such file, or it is malformed, or made for something else.
     """
     arrays = _read(path)
     try:
@@ -192,7 +188,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
             _check_sizes(archive)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
             return {name: np.asarray(found[name]) for name in found.files}
-    except ConfigError as error:
+    except UserError as error:
         raise ConfigError(f"{path}: {error}") from None
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file{nearest_file(path, ENDINGS)}") from None
@@ -203,7 +199,7 @@ def _read(path: Path) -> dict[str, np.ndarray]:
 
 
 def _check_sizes(archive: zipfile.ZipFile) -> None:
-    """Raise `ConfigError` for what would take much memory to read: it can be written in a few bytes."""
+    """Raise `UserError` for what would take much memory to read: it can be written in a few bytes."""
     members = archive.infolist()
     if len(members) > MAX_ARRAYS:
         raise ConfigError(f"holds {len(members)} arrays; allowed: up to {MAX_ARRAYS}")

@@ -7,7 +7,7 @@ import pytest
 from jax.sharding import AxisType
 
 import envs
-from envs.batching import AXIS, flattened, shared_out
+from envs.common.batching import AXIS, flattened, shared_out
 from envs.vector import VectorEnv
 
 NOTHING = jnp.zeros((0, 3))

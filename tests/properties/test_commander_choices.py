@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from star import commander
-from star.commander import CommanderState
+from star.agent import commander
+from star.agent.commander import CommanderState
 
 R, B = 6, 64
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from star import abstraction as regions
-from star.abstraction import Cut
+from star.abstraction import regions
+from star.abstraction.regions import Cut
 
 CUTS = 1000
 POINTS = 2000

@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from star import reachability
-from star.reachability import Network, Zonotope
+from star.abstraction import reachability
+from star.abstraction.reachability import Network, Zonotope
 
 POINTS = 100_000
 ARCHITECTURES = [  # widths of input, hidden layers and output; residual

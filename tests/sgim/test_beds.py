@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import abstraction as regions
 from star import sgim
+from star.abstraction import regions
 from star.sgim import beds, selectors
 
 BLOCKS, EPISODES = 2400, 5

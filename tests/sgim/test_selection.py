@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from star import abstraction as regions
 from star import sgim
+from star.abstraction import regions
 
 R, S, D = 5, 3, 2  # capacity, of which four regions are active
 CONFIG = sgim.Config(window=6, per_block=3)

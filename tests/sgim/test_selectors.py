@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from star import abstraction as regions
 from star import sgim
+from star.abstraction import regions
 from star.sgim import beds, mixtures, selectors
 
 R, S = 3, 2

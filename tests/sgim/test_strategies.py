@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import star.state
-from star import abstraction as regions
-from star import commander, episode, hierarchy, loading, ppo, refinement, td3
-from star.abstraction import Cut
-from star.config import SgimConfig
-from star.loading import ConfigError
-from star.refinement import Split
-from star.replay import Imitation, Transition
+from envs.common.errors import UserError
+from star import loading
+from star.abstraction import refinement, regions
+from star.abstraction.refinement import Split
+from star.abstraction.regions import Cut
+from star.agent import commander
+from star.agent import epoch as hierarchy
+from star.agent import play as episode
+from star.agent import state as states
+from star.learners import ppo, td3
+from star.learners.replay import Imitation, Transition
 from star.sgim import selection, strategies
+from star.sgim.sections import SgimConfig
 from star.sgim.teachers import Demonstrations, nearest
 from star.spec import Spec
 
@@ -403,7 +407,7 @@ def test_steps_of_demonstrations_lead_to_the_end_of_their_segment():
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(values, told):
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         loading.parse(values)
     assert told in str(error.value) and "\n" not in str(error.value)
 
@@ -431,32 +435,32 @@ def schooled(tiny, breaking_env):
         return hierarchy.epoch(parsed.agent(), spec, breaking_env, state, teachers)
 
     # With this key a region is cut, which is rare in so few epochs.
-    state = jax.jit(lambda key: star.state.init(parsed.agent(), spec, key=key))(jax.random.key(22))
-    states, metrics = [state], []
+    state = jax.jit(lambda key: states.init(parsed.agent(), spec, key=key))(jax.random.key(22))
+    seen, metrics = [state], []
     for _ in range(3):
         state, more = epoch(state)
-        states.append(state)
+        seen.append(state)
         metrics.append(more)
-    return parsed, states, metrics, len(traces)
+    return parsed, seen, metrics, len(traces)
 
 
 def test_sgim_follows_the_agent_through_its_epochs(schooled):
-    parsed, states, metrics, traces = schooled
+    parsed, seen, metrics, traces = schooled
     assert traces == 1
-    for state in states:
+    for state in seen:
         jax.tree.map(np.testing.assert_array_equal, state.sgim.abstraction, state.abstraction)
     for more in metrics:
         shares = [float(more[f"sgim/share_{name}"]) for name in parsed.sgim.names]
         assert sum(shares) == pytest.approx(1)
         assert 0 <= float(more["sgim/competence"]) <= 1 and int(more["sgim/refused"]) == 0
-    assert float(states[-1].sgim.episodes.sum()) > 0
-    remembered = selection.competence(states[-1].sgim)
+    assert float(seen[-1].sgim.episodes.sum()) > 0
+    remembered = selection.competence(seen[-1].sgim)
     assert np.isfinite(remembered).all() and (remembered > 0).any()
 
 
 def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env, monkeypatch):
     agent, spec = loading.parse({**tiny, "sgim": {"goals": True}}).agent(), Spec.of(breaking_env.env)
-    before = star.state.init(agent, spec, key=jax.random.key(0))
+    before = states.init(agent, spec, key=jax.random.key(0))
     last = int(before.abstraction.count)
     cuts = [Cut(jnp.int32(15), jnp.int32(0), jnp.float32(9.0)), Cut(jnp.int32(last), jnp.int32(1), jnp.float32(5.0))]
     undone = Cut(jnp.int32(3), jnp.int32(0), jnp.float32(-2.0))
@@ -490,7 +494,7 @@ def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(t
 
     @jax.jit
     def commanded(key, waypoints):
-        state = star.state.init(agent, spec, key=key)
+        state = states.init(agent, spec, key=key)
         streams = episode.start(spec, breaking_env, key=key)
         streams = streams.replace(lesson=lesson.replace(waypoints=waypoints))
         allowed = episode.successors(agent, state)
@@ -524,7 +528,7 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
     assert led.any() and not led.all()
 
     def chosen(key, lesson):
-        state = star.state.init(agent, turning, key=key)
+        state = states.init(agent, turning, key=key)
         streams = episode.start(turning, breaking_env, key=key).replace(lesson=lesson)
         began = streams.env.obs
         subgoal, action = episode.choose_subgoal(agent, turning, state, streams, deterministic=False, key=key)
@@ -553,7 +557,7 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
 
 def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, breaking_env):
     agent, spec = loading.parse({**tiny, "sgim": {"teachers": [GUIDE]}}).agent(), Spec.of(breaking_env.env)
-    state = star.state.init(agent, spec, key=jax.random.key(0))
+    state = states.init(agent, spec, key=jax.random.key(0))
     i, j = map(
         int,
         np.argwhere(np.asarray(regions.adjacent(state.abstraction)) & ~np.eye(len(state.graph.told), dtype=bool))[0],
@@ -580,7 +584,7 @@ def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, 
 
     @jax.jit
     def finished(key, terminated):
-        state = star.state.init(agent, spec, key=key)
+        state = states.init(agent, spec, key=key)
         streams = episode.start(spec, breaking_env, key=key).replace(lesson=lesson)
         allowed = episode.successors(agent, state)
         streams = episode.command(agent, spec, state, allowed, streams, epsilon=0.0, key=key)

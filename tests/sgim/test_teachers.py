@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import envs
+from envs.common.errors import UserError
 from envs.tasks import TASKS, own
-from star.config import ConfigError
 from star.sgim import teachers
 from star.sgim.teachers import Demonstrations
 from star.spec import Spec
@@ -244,7 +244,7 @@ def changed(name, index, value):
 )
 def test_a_file_that_does_not_fit_is_refused_in_one_line(tmp_path, changes, said):
     path = a_file(tmp_path, **changes)
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         teachers.load(path, **ABOUT)
     message = str(error.value)
     assert message.startswith(f"{path}: ") and said in message and "\n" not in message
@@ -252,13 +252,13 @@ def test_a_file_that_does_not_fit_is_refused_in_one_line(tmp_path, changes, said
 
 def test_a_file_made_for_a_body_in_three_dimensions_is_refused(tmp_path):
     spec = replace(SPEC, abstract_indices=(0, 1, 2), space=((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
-    with pytest.raises(ConfigError, match=r"starts has the shape \[3, 2\]; allowed: \[N, 3\]"):
+    with pytest.raises(UserError, match=r"starts has the shape \[3, 2\]; allowed: \[N, 3\]"):
         teachers.load(a_file(tmp_path), env="point_maze", spec=spec)
 
 
 def test_a_missing_file_is_refused_with_the_name_of_one_like_it(tmp_path):
     path = a_file(tmp_path)
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         teachers.load(tmp_path / "demo.npz", **ABOUT)
     assert str(error.value) == f"{tmp_path / 'demo.npz'}: no such file (did you mean {path}?)"
 
@@ -282,7 +282,7 @@ def _write_one_array(path):
 def test_what_is_no_file_of_arrays_is_refused_in_one_line(tmp_path, write):
     path = tmp_path / "demos.npz"
     write(path)
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         teachers.load(path, **ABOUT)
     assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
 
@@ -309,13 +309,13 @@ def test_an_archive_that_would_take_much_memory_is_refused_unread(tmp_path, monk
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in members.items():
             archive.writestr(name, data)
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         teachers.load(path, **ABOUT)
     assert str(error.value).startswith(f"{path}: {said}") and "\n" not in str(error.value)
 
 
 def test_a_device_is_no_file_of_demonstrations():
-    with pytest.raises(ConfigError, match="/dev/zero: cannot be read: Not a regular file"):
+    with pytest.raises(UserError, match="/dev/zero: cannot be read: Not a regular file"):
         teachers.load(Path("/dev/zero"), **ABOUT)
 
 
@@ -332,7 +332,7 @@ def test_a_damaged_file_is_read_as_it_was_or_refused(tmp_path_factory, data):
     path.write_bytes(damaged)
     try:
         demos = teachers.load(path, **ABOUT)
-    except ConfigError as error:
+    except UserError as error:
         assert "\n" not in str(error)
     else:
         np.testing.assert_array_equal(demos.waypoints, demonstrations().waypoints)
@@ -348,7 +348,7 @@ def test_a_damaged_file_is_read_as_it_was_or_refused(tmp_path_factory, data):
 )
 def test_what_cannot_be_written_is_refused_and_nothing_is_overwritten(tmp_path, name, said):
     (tmp_path / "old.npz").write_text("precious")
-    with pytest.raises(ConfigError) as error:
+    with pytest.raises(UserError) as error:
         teachers.save(tmp_path / name, demonstrations(), env="point_maze")
     assert said in str(error.value) and "\n" not in str(error.value)
     assert [path.name for path in tmp_path.iterdir()] == ["old.npz"]

@@ -24,9 +24,9 @@ from flax.linen import elu
 from jaxtyping import Array, Float
 
 from star import devices
-from star.config import PPOConfig
-from star.networks import MLP, Normalizer, apply
-from star.replay import Imitation, Penalty, Transition, flatten
+from star.learners.networks import MLP, Normalizer, apply
+from star.learners.replay import Imitation, Penalty, Transition, flatten
+from star.learners.sections import PPOConfig
 
 Metrics = dict[str, Array]
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from star.config import ControllerConfig
+from star.agent.sections import ControllerConfig
 from star.spec import Spec
 
 

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float
 
-from star.config import TutorConfig
-from star.replay import Transition
+from star.agent.sections import TutorConfig
+from star.learners.replay import Transition
 
 
 class Box(struct.PyTreeNode):

@@ -22,8 +22,8 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from star.config import AdjacencyConfig
-from star.networks import MLP, apply, descend
+from star.agent.sections import AdjacencyConfig
+from star.learners.networks import MLP, apply, descend
 
 Metrics = dict[str, Array]
 

@@ -20,10 +20,10 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float
 
-from star import replay
-from star.config import ForwardModelConfig
-from star.networks import MLP, apply, descend
-from star.reachability import ROUNDING, Network
+from star.abstraction.reachability import ROUNDING, Network
+from star.abstraction.sections import ForwardModelConfig
+from star.learners import replay
+from star.learners.networks import MLP, apply, descend
 
 Metrics = dict[str, Array]
 

@@ -24,23 +24,26 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from envs.batching import where
+from envs.common.batching import where
 from envs.vector import VectorEnv
-from star import abstraction as regions
-from star import adjacency, commander, controller, devices, episode, faults, forward_model, learner, refinement, tutor
-from star.abstraction import Abstraction
-from star.commander import CommanderState, Decision, Model, Successors
-from star.config import AgentConfig
-from star.episode import Episode, Steps, Streams
-from star.forward_model import Outcome
-from star.replay import Imitation, Penalty, Transition, flatten, weighted_mean
+from star import devices, faults
+from star.abstraction import forward_model, refinement, regions
+from star.abstraction.forward_model import Outcome
+from star.abstraction.regions import Abstraction
+from star.agent import adjacency, commander, controller, tutor
+from star.agent import play as episode
+from star.agent.commander import CommanderState, Decision, Model, Successors
+from star.agent.play import Episode, Steps, Streams
+from star.agent.sections import AgentConfig
+from star.agent.state import TrainState
+from star.agent.tutor import Box, Trace
+from star.learners import learner
+from star.learners.replay import Imitation, Penalty, Transition, flatten, weighted_mean
 from star.sgim import selection, strategies
 from star.sgim.selection import SgimState
 from star.sgim.strategies import Lesson
 from star.sgim.teachers import Demonstrations
 from star.spec import Spec
-from star.state import TrainState
-from star.tutor import Box, Trace
 
 Metrics = dict[str, Array]
 

@@ -20,10 +20,11 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from star import devices, replay
-from star.config import TD3Config
-from star.networks import MLP, apply
-from star.replay import Imitation, Penalty, Transition, flatten, weighted_mean
+from star import devices
+from star.learners import replay
+from star.learners.networks import MLP, apply
+from star.learners.replay import Imitation, Penalty, Transition, flatten, weighted_mean
+from star.learners.sections import TD3Config
 
 Metrics = dict[str, Array]
 Relabel = Callable[[Transition, Array], Transition]

@@ -27,13 +27,12 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from envs.batching import where
-from star import abstraction as regions
-from star import forward_model, reachability
-from star.abstraction import Abstraction, Cut
-from star.config import AgentConfig
-from star.forward_model import ForwardModelState, Outcome
-from star.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves
+from envs.common.batching import where
+from star.abstraction import forward_model, reachability, regions
+from star.abstraction.forward_model import ForwardModelState, Outcome
+from star.abstraction.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves
+from star.abstraction.regions import Abstraction, Cut
+from star.agent.sections import AgentConfig
 
 Metrics = dict[str, Array]
 

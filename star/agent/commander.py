@@ -38,8 +38,8 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from star.config import CommanderConfig
-from star.replay import weighted_mean
+from star.agent.sections import CommanderConfig
+from star.learners.replay import weighted_mean
 
 Metrics = dict[str, Array]
 

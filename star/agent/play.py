@@ -19,18 +19,19 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from envs._quiet import State as EnvState
-from envs.batching import where
+from envs.common.batching import where
 from envs.vector import VectorEnv
-from star import abstraction as regions
-from star import commander, controller, learner, tutor
-from star.abstraction import Abstraction
-from star.commander import CommanderState, Successors
-from star.config import AgentConfig
+from star.abstraction import regions
+from star.abstraction.regions import Abstraction
+from star.agent import commander, controller, tutor
+from star.agent.commander import CommanderState, Successors
+from star.agent.sections import AgentConfig
+from star.agent.state import TrainState
+from star.agent.tutor import Box
+from star.learners import learner
 from star.sgim import strategies
 from star.sgim.strategies import Lesson
 from star.spec import Spec
-from star.state import TrainState
-from star.tutor import Box
 
 _ANY = 1_000_000  # a region to practise that is still to be drawn; larger than any index
 

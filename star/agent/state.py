@@ -12,19 +12,20 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Int
 
-from star import abstraction as regions
-from star import adjacency, commander, controller, forward_model, learner, refinement
-from star.abstraction import Abstraction
-from star.adjacency import AdjacencyState
-from star.commander import CommanderState
-from star.config import AgentConfig, Config
-from star.forward_model import ForwardModelState
-from star.refinement import Graph
-from star.replay import Transition
+from star.abstraction import forward_model, refinement, regions
+from star.abstraction.forward_model import ForwardModelState
+from star.abstraction.refinement import Graph
+from star.abstraction.regions import Abstraction
+from star.agent import adjacency, commander, controller
+from star.agent.adjacency import AdjacencyState
+from star.agent.commander import CommanderState
+from star.agent.sections import AgentConfig, Config
+from star.agent.tutor import Trace
+from star.learners import learner
+from star.learners.replay import Transition
 from star.sgim import strategies
 from star.sgim.selection import SgimState
 from star.spec import Spec
-from star.tutor import Trace
 
 
 class TrainState(struct.PyTreeNode):

@@ -6,8 +6,8 @@ A learner is a module with three functions:
     act(config, state, obs, *, deterministic, key)        -> action
     update(config, state, rollout, *, key)                -> state, metrics
 
-`update` sees a rollout [T, B] of `star.replay.Transition`. An off-policy learner also takes `relabel`, applied to
-every batch it replays. Every learner takes `penalty`, which prices the actor's action in a transition, and
+`update` sees a rollout [T, B] of `star.learners.replay.Transition`. An off-policy learner also takes `relabel`,
+applied to every batch it replays. Every learner takes `penalty`, which prices the actor's action in a transition, and
 `imitation`, actions of somebody else to come near to.
 """
 
@@ -17,9 +17,9 @@ from typing import Any
 
 from jaxtyping import Array, Float
 
-from star import ppo, td3
-from star.config import LevelConfig
-from star.replay import Imitation, Penalty, Transition
+from star.learners import ppo, td3
+from star.learners.replay import Imitation, Penalty, Transition
+from star.learners.sections import LevelConfig
 
 State = ppo.PPOState | td3.TD3State
 Metrics = dict[str, Array]

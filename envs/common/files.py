@@ -1,0 +1,66 @@
+"""Files that appear whole or not at all, and the one that was meant where there is none."""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from envs.common.errors import UserError
+
+
+def check(path: Path, endings: Sequence[str], *, force: bool = False) -> None:
+    """Raise `UserError` in one line if `path` cannot be written, or would be replaced without `force`."""
+    try:
+        if path.is_dir():
+            raise UserError(f"{path}: is a folder")
+    except OSError as error:  # such as a name too long
+        raise UserError(f"{path}: cannot be written: {error.strerror}") from None
+    if path.suffix.lower() not in endings:
+        raise UserError(f"{path}: cannot tell what to write; allowed endings: {', '.join(endings)}")
+    if not path.parent.is_dir():
+        raise UserError(f"{path}: there is no folder {path.parent}")
+    if not os.access(path.parent, os.W_OK):
+        raise UserError(f"{path}: cannot be written: the folder {path.parent} is not writable")
+    if path.exists() and not force:
+        raise UserError(f"{path}: exists; replace it with --force")
+
+
+@contextlib.contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """Where to write what becomes `path`, replacing an existing file, once all has been written.
+
+    Raises:
+      UserError: in one line, if it cannot be written.
+    """
+    try:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:
+            partial = Path(folder) / path.name
+            yield partial
+            sync(partial)
+            os.replace(partial, path)
+            sync(path.parent)
+    except OSError as error:
+        raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def sync(path: Path) -> None:
+    """Have the system write a file, or the names in a folder, to the disk: what it holds survives a loss of power."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def nearest_file(path: Path, endings: Sequence[str]) -> str:
+    """` (did you mean ...?)` with the file beside `path` whose name is most like it, of those with these endings."""
+    try:
+        names = [entry.name for entry in path.parent.iterdir() if entry.suffix in endings]
+    except (OSError, ValueError):  # no such folder, or not one of ours
+        return ""
+    matches = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
+    return f" (did you mean {path.parent / matches[0]}?)" if matches else ""

@@ -1,0 +1,1 @@
+"""What all settings are made of, and those of a run."""
