@@ -21,6 +21,7 @@ from rich.console import Console
 from envs.common import reading
 from envs.common.errors import UserError
 from star.agent.sections import Config
+from star.config import plugins
 from star.config.run import TrainerConfig
 from star.config.section import ConfigError
 from star.loading import fields, load, parse
@@ -62,6 +63,7 @@ does, as demonstrations for other agents: routes, states and actions."""
 _REPORT = """\
 One page with the curves of the runs over each other, how their regions grew, what they are worth to the Commander,
 the settings in which the runs differ, and films. It needs no network. A run may still be going on."""
+_READ_CONFIGS = ("train", "sweep", "evaluate", "render", "record", "report")
 _LONGEST_ERROR = 1000  # characters
 _MOST_PROFILED = 20  # epochs; a trace takes tens of MB for each
 _SWEEP = """\
@@ -115,6 +117,8 @@ def _run(arguments: list[str]) -> int:
     if options.command is None:
         parser.print_help()
         return 0
+    for name in (*getattr(options, "modules", []), *filter(plugins.is_plugin, overrides.values())):
+        plugins.trust(name.partition(":")[0])
     flags = {name: _value(text) for name, text in vars(options).items() if "." in name and text is not None}
     return options.function(options, flags | overrides)
 
@@ -165,6 +169,15 @@ def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentPa
     settings = commands.add_parser("settings", help="list every setting with its default and meaning", **shape)
     settings.add_argument("prefix", nargs="?", default="", help="only settings that begin so, such as tutor")
     settings.set_defaults(function=_settings)
+    for name in _READ_CONFIGS:
+        commands.choices[name].add_argument(
+            "--import",
+            dest="modules",
+            action="append",
+            default=[],
+            metavar="MODULE",
+            help="a module of your own that a config or a run names, as in learner: MODULE:NAME",
+        )
     return parser, commands.choices
 
 

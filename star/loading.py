@@ -100,10 +100,11 @@ def fields(section: type[Section] = Config, prefix: str = "") -> Iterator[tuple[
     """All settings as (dotted key, default, description)."""
     for name, field in section.model_fields.items():
         annotation = field.annotation
-        if isinstance(annotation, type) and issubclass(annotation, Section):
+        if isinstance(annotation, type) and issubclass(annotation, Section) and annotation.model_fields:
             yield from fields(annotation, f"{prefix}{name}.")
         else:
-            yield f"{prefix}{name}", field.default, field.description or ""
+            default = {} if isinstance(field.default, Section) else field.default
+            yield f"{prefix}{name}", default, field.description or ""
 
 
 def dotted(config: Config) -> dict[str, Any]:

@@ -52,19 +52,15 @@ def _passing(program: Program) -> dict[str, int]:
     if config.commander.enabled:
         found["forward_model"] = seeds * _activations(model.batch_size, model.hidden)
     if tutor.off_policy_correction:  # the Controller's policy for each candidate
-        hidden = getattr(config.controller, config.controller.learner).hidden
-        rows = tutor.correction_candidates * tutor.td3.batch_size * tutor.period
+        hidden = getattr(config.controller.settings, "hidden", ())
+        rows = tutor.correction_candidates * getattr(tutor.settings, "batch_size", 0) * tutor.period
         found["tutor.correction_candidates"] = seeds * _activations(rows, hidden[:1])
     if near.enabled:
         found["tutor.adjacency"] = seeds * _activations(near.batch_size, (*near.hidden, near.features))
     examples = dict(zip(("tutor", "controller"), states.examples(config.agent(), program.spec), strict=True))
-    for name, level, decisions in config.learners():
-        count = seeds * decisions * config.trainer.num_envs
-        found[f"{name}, trainer.num_envs"] = count * _bytes(examples[name])
-        if level.learner == "td3":
-            found[f"{name}.td3"] = seeds * _activations(level.td3.batch_size, level.td3.hidden)
-        else:
-            found[f"{name}.ppo"] = _activations(count // level.ppo.minibatches, level.ppo.hidden)
+    for name, level, rollout in config.learners():
+        found[f"{name}, trainer.num_envs"] = seeds * rollout.size * _bytes(examples[name])
+        found[f"{name}.{level.group}"] = seeds * level.settings.scratch_bytes(rollout)
     return found
 
 

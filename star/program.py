@@ -16,7 +16,7 @@ from jax.sharding import Mesh
 import envs
 from envs import arena
 from envs.vector import VectorEnv
-from star import devices
+from star import devices, learners
 from star.agent import epoch as hierarchy
 from star.agent import play as episode
 from star.agent import state as states
@@ -24,7 +24,6 @@ from star.agent.play import Episode
 from star.agent.sections import AgentConfig, Config
 from star.agent.state import TrainState
 from star.config.section import ConfigError
-from star.learners.td3 import TD3State
 from star.loading import parse
 from star.sgim import teachers
 from star.sgim.sections import TeacherConfig
@@ -148,7 +147,7 @@ def build(config: Config) -> Program:
 
         return jax.vmap(one_evaluation, in_axes=(_axis(agent), 0, 0))(agent, state, keys)
 
-    placement = _placement(mesh, jax.eval_shape(init, config.agent(), seed_keys([0])))
+    placement = _placement(config, mesh, jax.eval_shape(init, config.agent(), seed_keys([0])))
     everywhere = devices.everywhere(mesh)
     functions = Functions(
         init=jax.jit(init, out_shardings=placement),
@@ -227,17 +226,18 @@ def evaluation_keys(seeds: Sequence[int], numbers: Sequence[int] | np.ndarray, *
     )
 
 
-def _placement(mesh: Mesh | None, state: TrainState) -> TrainState:
-    """Where the leaves of `state` lie between epochs: the rings of the levels in shares, all else whole."""
+def _placement(config: Config, mesh: Mesh | None, state: TrainState) -> TrainState:
+    """Where the leaves of `state` lie between epochs: what the learners of levels cut in shares, all else whole."""
     places = jax.tree.map(lambda _: devices.everywhere(mesh), state)
-    slots = devices.in_shares(mesh, axis=2)  # of rings [seeds, 1, slots, ...]
 
-    def cut(level: Any) -> Any:
-        if not isinstance(level, TD3State):
-            return level
-        return level.replace(ring=level.ring.replace(experience=jax.tree.map(lambda _: slots, level.ring.experience)))
+    def of(axis: int) -> Any:
+        return devices.everywhere(mesh) if axis == learners.WHOLE else devices.in_shares(mesh, axis=1 + axis)
 
-    return places.replace(tutor=cut(places.tutor), controller=cut(places.controller))
+    levels = {
+        name: jax.tree.map(of, learners.find(level.learner).shards(getattr(state, name)))
+        for name, level, _ in config.learners()
+    }
+    return places.replace(**levels)
 
 
 def _as_on_first(state: TrainState, placement: TrainState) -> TrainState:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from envs.common.batching import where
 from envs.vector import VectorEnv
-from star import devices, faults
+from star import devices, faults, learners
 from star.abstraction import forward_model, refinement, regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.regions import Abstraction
@@ -37,7 +37,6 @@ from star.agent.play import Episode, Steps, Streams
 from star.agent.sections import AgentConfig
 from star.agent.state import TrainState
 from star.agent.tutor import Box, Trace
-from star.learners import learner
 from star.learners.replay import Imitation, Penalty, Transition, flatten, weighted_mean
 from star.sgim import selection, strategies
 from star.sgim.selection import SgimState
@@ -181,7 +180,7 @@ def _block(
     metrics = jax.tree.map(jnp.mean, metrics)
     if decisions is not None:
         relabel = _relabel(config, spec, state) if config.tutor.off_policy_correction else None
-        learnt, more = learner.update(
+        learnt, more = learners.update(
             config.tutor,
             state.tutor,
             decisions,
@@ -218,7 +217,7 @@ def _segment(
 
     experience = _controller_rollout(config, spec, steps, env_steps=now)
     in_hindsight = partial(_in_hindsight, config, spec) if config.controller.hindsight else None
-    controller_state, controller_metrics = learner.update(
+    controller_state, controller_metrics = learners.update(
         config.controller,
         state.controller,
         experience,
@@ -485,7 +484,7 @@ def _relabel(config: AgentConfig, spec: Spec, state: TrainState) -> Any:
 
     def mean_action(states: Array, subgoals: Array) -> Array:
         seen = controller.observe(config.controller, spec, states, subgoals)
-        return learner.act(config.controller, state.controller, seen, deterministic=True, key=state.key)
+        return learners.act(config.controller, state.controller, seen, deterministic=True, key=state.key)
 
     def relabel(batch: Transition, key: Array) -> Transition:
         return tutor.correct(config.tutor, batch, spec.scale, mean_action, key=key)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from envs._quiet import State as EnvState
 from envs.common.batching import where
 from envs.vector import VectorEnv
+from star import learners
 from star.abstraction import regions
 from star.abstraction.regions import Abstraction
 from star.agent import commander, controller, tutor
@@ -28,7 +29,6 @@ from star.agent.commander import CommanderState, Successors
 from star.agent.sections import AgentConfig
 from star.agent.state import TrainState
 from star.agent.tutor import Box
-from star.learners import learner
 from star.sgim import strategies
 from star.sgim.strategies import Lesson
 from star.spec import Spec
@@ -316,7 +316,7 @@ def choose_subgoal(
     if state.tutor is None:
         return streams.box.seen_from(position).corners, None
     seen = tutor.observe(config.tutor, spec.state(obs), position, streams.box)
-    action = learner.act(config.tutor, state.tutor, seen, deterministic=deterministic, key=key)
+    action = learners.act(config.tutor, state.tutor, seen, deterministic=deterministic, key=key)
     if streams.lesson is not None and config.sgim.shows_subgoals:
         straight = jnp.clip(spec.towards(obs, strategies.coming(streams.lesson)) / spec.scale, -1.0, 1.0)
         action = jnp.where(strategies.guided(config.sgim, streams.lesson)[:, None], straight, action)
@@ -344,7 +344,7 @@ def rollout(
         env_state, subgoal, alive, episode = carry
         obs = env_state.obs
         seen = controller.observe(config.controller, spec, spec.state(obs), subgoal)
-        action = learner.act(config.controller, state.controller, seen, deterministic=deterministic, key=step_key)
+        action = learners.act(config.controller, state.controller, seen, deterministic=deterministic, key=step_key)
         recorded = record(env_state, subgoal, streams.box, action) if record else None
         env_state = env.step(env_state, action)
         after = controller.next_subgoal(subgoal, spec.pose(obs), spec.pose(env_state.obs))

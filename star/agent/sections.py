@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Literal, Self
 
 import yaml
@@ -10,6 +11,7 @@ from pydantic import Field, model_validator
 from star.abstraction.sections import AbstractionConfig, ForwardModelConfig, RefinementConfig
 from star.config.run import EnvConfig, TrainerConfig
 from star.config.section import Batch, Hidden, Positive, Repeats, Section
+from star.learners import Rollout
 from star.learners.sections import LevelConfig
 from star.sgim.sections import SgimConfig
 
@@ -99,7 +101,7 @@ class TutorConfig(LevelConfig):
 
     @model_validator(mode="after")
     def _correction_needs_replay(self) -> Self:
-        if self.off_policy_correction and self.learner != "td3":
+        if self.off_policy_correction and not self.settings.replays:
             raise ValueError("off_policy_correction needs learner td3, which replays old subgoals")
         return self
 
@@ -130,7 +132,7 @@ class ControllerConfig(LevelConfig):
 
     @model_validator(mode="after")
     def _hindsight_needs_replay(self) -> Self:
-        if self.hindsight and self.learner != "td3":
+        if self.hindsight and not self.settings.replays:
             raise ValueError("hindsight needs learner td3, which replays old transitions")
         return self
 
@@ -154,29 +156,18 @@ class Config(Section):
             raise ValueError(
                 f"commander.period: {self.commander.period} is not a multiple of tutor.period {self.tutor.period}"
             )
-        for name, section, decisions in self.learners():
-            rollout = decisions * self.trainer.num_envs
-            if section.learner == "ppo" and rollout % section.ppo.minibatches:
-                raise ValueError(
-                    f"{name}.ppo.minibatches: {section.ppo.minibatches} does not divide the rollout of {rollout} "
-                    f"decisions ({decisions} of each of {self.trainer.num_envs} environments)"
-                )
         return self
 
     @model_validator(mode="after")
-    def _devices_share_evenly(self) -> Self:
+    def _learners_have_their_shares(self) -> Self:
         devices, num_envs = self.trainer.devices, self.trainer.num_envs
-        shared = [("trainer.num_envs", num_envs, num_envs)]
-        for name, section, decisions in self.learners():
-            if section.learner == "td3":
-                shared.append((f"{name}.td3.buffer_size", section.td3.buffer_size, section.td3.buffer_size))
-            else:
-                batch = decisions * num_envs // section.ppo.minibatches
-                shared.append((f"{name}.ppo.minibatches", section.ppo.minibatches, batch))
-        for key, value, size in shared:
-            if size % devices:
-                of = "" if size == value else f" makes minibatches of {size}, which"
-                raise ValueError(f"{key}: {value}{of} cannot be shared evenly by trainer.devices {devices}")
+        if num_envs % devices:
+            raise ValueError(f"trainer.num_envs: {num_envs} cannot be shared evenly by trainer.devices {devices}")
+        for name, section, rollout in self.learners():
+            try:
+                section.settings.check(rollout)
+            except ValueError as error:
+                raise ValueError(f"{name}.{section.group}.{error}") from None
         return self
 
     @model_validator(mode="after")
@@ -191,10 +182,11 @@ class Config(Section):
             raise ValueError("sgim.refinement: needs commander.enabled and refinement.enabled, whose pairs it orders")
         return self
 
-    def learners(self) -> list[tuple[str, LevelConfig, int]]:
-        """The levels that learn from rollouts: name, section, and decisions of each environment in a rollout."""
-        tutor = [("tutor", self.tutor, self.tutor.unroll)] if self.tutor.enabled else []
-        return [*tutor, ("controller", self.controller, self.tutor.period)]
+    def learners(self) -> list[tuple[str, LevelConfig, Rollout]]:
+        """The levels that learn from rollouts: name, section, and how large these are."""
+        size = partial(Rollout, num_envs=self.trainer.num_envs, devices=self.trainer.devices)
+        tutor = [("tutor", self.tutor, size(self.tutor.unroll))] if self.tutor.enabled else []
+        return [*tutor, ("controller", self.controller, size(self.tutor.period))]
 
     def agent(self) -> AgentConfig:
         """The sections that the jitted program sees."""

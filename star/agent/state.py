@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Int
 
+from star import learners
 from star.abstraction import forward_model, refinement, regions
 from star.abstraction.forward_model import ForwardModelState
 from star.abstraction.refinement import Graph
@@ -21,7 +22,6 @@ from star.agent.adjacency import AdjacencyState
 from star.agent.commander import CommanderState
 from star.agent.sections import AgentConfig, Config
 from star.agent.tutor import Trace
-from star.learners import learner
 from star.learners.replay import Transition
 from star.sgim import strategies
 from star.sgim.selection import SgimState
@@ -32,9 +32,9 @@ class TrainState(struct.PyTreeNode):
     """Everything a run knows between two epochs. Environments are reset by every epoch, so they are not part of it."""
 
     commander: CommanderState
-    tutor: learner.State | None
+    tutor: Any
     adjacency: AdjacencyState | None
-    controller: learner.State
+    controller: Any
     abstraction: Abstraction
     graph: Graph
     forward_model: ForwardModelState
@@ -51,9 +51,9 @@ def init(config: AgentConfig, spec: Spec, *, key: Array) -> TrainState:
     tutor_example, controller_example = examples(config, spec)
     return TrainState(
         commander=commander.init(config.commander, regions=abstraction.capacity),
-        tutor=learner.init(tutor_key, config.tutor, example=tutor_example) if config.tutor.enabled else None,
+        tutor=learners.init(tutor_key, config.tutor, example=tutor_example) if config.tutor.enabled else None,
         adjacency=adjacency.init(adjacency_key, adjacent, spec.space) if adjacent.enabled else None,
-        controller=learner.init(controller_key, config.controller, example=controller_example),
+        controller=learners.init(controller_key, config.controller, example=controller_example),
         abstraction=abstraction,
         graph=refinement.init(capacity=abstraction.capacity),
         forward_model=forward_model.init(model_key, config.forward_model, space=abstraction.space),
@@ -103,10 +103,6 @@ def check(config: Config, spec: Spec) -> None:
             f"abstraction.grid: {math.prod(grid)} initial regions exceed abstraction.max_regions "
             f"{config.abstraction.max_regions}"
         )
-    for name, section, decisions in config.learners():
-        rollout = decisions * config.trainer.num_envs
-        if section.learner == "td3" and section.td3.buffer_size < rollout:
-            raise ValueError(f"{name}.td3.buffer_size: {section.td3.buffer_size} is below one rollout of {rollout}")
     try:
         regions.create(spec.space, first_cuts(config, spec), max_regions=config.abstraction.max_regions)
     except ValueError as error:

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 
 from star import devices
 from star.learners.networks import MLP, Normalizer, apply
+from star.learners.protocol import Learner
 from star.learners.replay import Imitation, Penalty, Transition, flatten
 from star.learners.sections import PPOConfig
 
@@ -244,3 +245,6 @@ def _adapt(config: PPOConfig, learning_rate: Array, kl: Array) -> Array:
     """Shrink the step size when the policy moved too far in a pass, grow it when it hardly moved."""
     factor = jnp.where(kl > 2 * config.target_kl, 1 / 1.5, jnp.where(kl < config.target_kl / 2, 1.5, 1.0))
     return jnp.clip(learning_rate * factor, 1e-5, config.max_learning_rate)
+
+
+LEARNER = Learner(PPOConfig, init, act, update)

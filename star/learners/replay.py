@@ -46,6 +46,9 @@ class Imitation(struct.PyTreeNode):
         return 0.5 * jnp.mean(self.weight * jnp.sum(jnp.square(mean - self.action), axis=-1))
 
 
+Relabel = Callable[[Transition, Array], Transition]
+"""A batch that is replayed, rewritten in the light of what is known today, with a random key."""
+
 Penalty = Callable[[Transition, Array], Array]
 """The price [N] of actions [N, act] that an actor would take in a batch of transitions."""
 

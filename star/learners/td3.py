@@ -10,7 +10,7 @@ Every rollout enters the replay buffer, then `updates_per_rollout` batches are d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -23,11 +23,11 @@ from jaxtyping import Array, Float, Int
 from star import devices
 from star.learners import replay
 from star.learners.networks import MLP, apply
-from star.learners.replay import Imitation, Penalty, Transition, flatten, weighted_mean
+from star.learners.protocol import Learner, whole
+from star.learners.replay import Imitation, Penalty, Relabel, Transition, flatten, weighted_mean
 from star.learners.sections import TD3Config
 
 Metrics = dict[str, Array]
-Relabel = Callable[[Transition, Array], Transition]
 
 
 class TD3State(struct.PyTreeNode):
@@ -189,3 +189,12 @@ def _adam_step(
 def _action_size(state: TD3State) -> int:
     layers = state.params["actor"]["params"]
     return layers[f"Dense_{len(layers) - 1}"]["bias"].shape[-1]
+
+
+def shards(state: TD3State) -> TD3State:
+    """The slots of the replay buffer, axis 1 of [1, slots, ...], are cut among devices; all else is whole on each."""
+    axes = whole(state)
+    return axes.replace(ring=axes.ring.replace(experience=jax.tree.map(lambda _: 1, axes.ring.experience)))
+
+
+LEARNER = Learner(TD3Config, init, act, update, shards)
