@@ -76,8 +76,7 @@ class Point:
     def step(self, data: PointState, action: jax.Array) -> PointState:
         """Move for `dt` seconds, then open the gates if it is time; `action` [2] in [-1, 1]."""
         velocity = (1 - RESPONSE) * data.velocity + RESPONSE * self._max_speed * action
-        moved = self._move(data, self.dt * velocity)
-        stopped = moved.position != data.position + self.dt * velocity
+        moved, stopped = self._move(data, self.dt * velocity)
         is_open = data.open
         if self._switch is not None:
             is_open = jnp.maximum(is_open, self._switch.holds(moved.position).astype(jnp.float32))
@@ -90,7 +89,7 @@ class Point:
 
     def displace(self, data: PointState, offset: jax.Array) -> PointState:
         """The point moved by `offset` [2], as far as the walls let it."""
-        return self._move(data, offset)
+        return self._move(data, offset)[0]
 
     def flipped(self, data: PointState) -> jax.Array:
         """Never."""
@@ -126,17 +125,20 @@ class Point:
         centres = (gates[:, :2] + gates[:, 2:]) / 2
         return data.position, jnp.concatenate([centres, jnp.full((len(gates), 1), z)], axis=1)
 
-    def _move(self, data: PointState, offset: jax.Array) -> PointState:
-        """As far along `offset` [2] as the walls let it, first along x, then along y."""
+    def _move(self, data: PointState, offset: jax.Array) -> tuple[PointState, jax.Array]:
+        """As far along `offset` [2] as the walls let it, first along x, then along y; and which walls stopped [2]."""
         aim = data.position + offset
-        x = self._advance(0, data.open, data.position[0], data.position[1], aim[0])
-        y = self._advance(1, data.open, data.position[1], x, aim[1])
-        return data.replace(position=jnp.stack([x, y]))
+        x, at_x = self._advance(0, data.open, data.position[0], data.position[1], aim[0])
+        y, at_y = self._advance(1, data.open, data.position[1], x, aim[1])
+        return data.replace(position=jnp.stack([x, y])), jnp.stack([at_x, at_y])
 
-    def _advance(self, axis: int, is_open: jax.Array, here: jax.Array, across: jax.Array, aim: jax.Array) -> jax.Array:
-        """Where a move along `axis` from `here` to `aim` ends, the other coordinate being `across`."""
+    def _advance(
+        self, axis: int, is_open: jax.Array, here: jax.Array, across: jax.Array, aim: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Where a move along `axis` from `here` to `aim` ends, the other coordinate being `across`; if at a wall."""
         there = (is_open == 0) | ~self._is_gate
         beside = there & (across > self._lower[:, 1 - axis]) & (across < self._upper[:, 1 - axis])
         ahead = jnp.where(beside & (here <= self._lower[:, axis]), self._lower[:, axis], jnp.inf)
         behind = jnp.where(beside & (here >= self._upper[:, axis]), self._upper[:, axis], -jnp.inf)
-        return jnp.clip(aim, behind.max(), ahead.min())
+        low, high = behind.max(), ahead.min()
+        return jnp.clip(aim, low, high), (aim < low) | (aim > high)
