@@ -25,7 +25,7 @@ from star import cli
 from star import program as programs
 from star.abstraction import forward_model as models
 from star.abstraction import refinement
-from star.agent import epoch as hierarchy
+from star.agent.state import TrainState
 from star.loading import load
 
 
@@ -59,7 +59,14 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
     )
     goals = refinement.Goals.of(fresh, jnp.ones_like(fresh.weight, bool), radius=program.spec.success_radius)
     keys = jax.random.split(jax.random.key(0), len(program.seeds))
-    refine = jax.jit(jax.vmap(lambda s, g, k: hierarchy.refine(agent, program.spec, s, g, key=k)))
+    radius = program.spec.success_radius
+
+    @jax.jit
+    @jax.vmap
+    def refine(state: TrainState, goals: refinement.Goals, key: jax.Array) -> Any:
+        tables = state.abstraction, state.graph, state.forward_model
+        return refinement.refine(agent, *tables, goals, radius=radius, key=key)
+
     train = jax.jit(jax.vmap(lambda s, f, k: models.train(agent.forward_model, s, f, key=k)))
     return {
         "task": config.env.name,

@@ -31,9 +31,8 @@ from envs.vector import VectorEnv
 from star import program as programs
 from star.abstraction import forward_model
 from star.abstraction.reachability import MISSES, REACHES
-from star.agent import epoch as hierarchy
-from star.agent import play as episode
-from star.agent.commander import Decision, Successors
+from star.agent import levels, play
+from star.agent.decisions import Decision, Roadmap, Successors
 from star.agent.sections import AgentConfig
 from star.agent.state import TrainState
 from star.checkpoint import load_state
@@ -50,23 +49,26 @@ def rollouts(
 
     Commands are drawn from `pairs` [R, R]; from a region that has none there, from all regions.
     """
+    section = config.commander.model_copy(
+        update={"epsilon_start": 1.0, "epsilon_end": 1.0, "epsilon_spread": False, "practice": 1.0}
+    )  # all practise, so that targets are regions, never goals
+    agent = levels.of(config.model_copy(update={"commander": section}), spec, greedy=True)
     active = state.abstraction.active[:, None] & state.abstraction.active[None, :]
     chosen = jnp.where(pairs.any(axis=1, keepdims=True), pairs, active)
-    allowed = Successors(greedy=active, explore=chosen)
+    roadmap = Roadmap.of(section, state.abstraction, state.graph)
+    roadmap = roadmap.replace(allowed=Successors(greedy=active, explore=chosen))
+    never = jnp.zeros(())
 
-    def segment(streams: episode.Streams, key: jax.Array) -> tuple[episode.Streams, Any]:
+    def segment(streams: play.Streams, key: jax.Array) -> tuple[play.Streams, Any]:
         command_key, tutor_key, rollout_key, reset_key = jax.random.split(key, 4)
-        streams = episode.command(config, spec, state, allowed, streams, epsilon=1.0, key=command_key)
-        subgoal, _ = episode.choose_subgoal(config, spec, state, streams, deterministic=False, key=tutor_key)
-        streams, steps = episode.rollout(
-            config, spec, env, state, streams, subgoal, deterministic=False, key=rollout_key
-        )
-        streams = episode.advance(config, streams)
-        finished = hierarchy.finished_period(config, spec, state, streams, steps)
-        return episode.restart_ended(spec, env, streams, steps, key=reset_key), finished
+        keys = (command_key, tutor_key, rollout_key)
+        streams, passed, marks = play.segment(agent, env, state, roadmap, streams, env_steps=never, keys=keys)
+        memory, finished = agent.commander.experience(section, agent.task, roadmap, streams.memory, passed, marks)
+        streams = streams.replace(memory=memory)
+        return play.restart_ended(agent, env, streams, passed, key=reset_key), finished
 
     start_key, scan_key = jax.random.split(key)
-    streams = episode.start(spec, env, practice=1.0, key=start_key)  # so that targets are regions, never goals
+    streams = play.start(agent, env, key=start_key)
     keys = jax.random.split(scan_key, spec.episode_length // config.tutor.period)
     return jax.lax.scan(segment, streams, keys)[1]
 

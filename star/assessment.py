@@ -26,7 +26,7 @@ from envs import routes
 from envs.vector import VectorEnv
 from star import checkpoint, evaluation, report
 from star import program as programs
-from star.agent import play as episode
+from star.agent.play import Episode, greedy
 from star.agent.sections import Config
 from star.checkpoint import Checkpoints, check_compatible
 from star.config.section import ConfigError
@@ -154,7 +154,7 @@ def player(course: Course, episodes: int) -> Callable[[Any, Any, jax.Array], Tri
         return spec.abstract(env_state.obs), env_state.metrics["success"]
 
     def one(agent: Any, state: Any, key: jax.Array) -> Trials:
-        streams, moments = episode.play(agent, spec, tested, state, goals=course.goals, record=look, key=key)
+        streams, moments = greedy(agent, spec, tested, state, goals=course.goals, record=look, key=key)
         position, success = jax.tree.map(
             lambda many, end: jnp.concatenate([many, end[None]]), moments, look(streams.env)
         )
@@ -163,7 +163,7 @@ def player(course: Course, episodes: int) -> Callable[[Any, Any, jax.Array], Tri
     return jax.jit(lambda agent, states, keys: jax.vmap(lambda state, key: one(agent, state, key))(states, keys))
 
 
-def measure(ended: episode.Episode, position: jax.Array, success: jax.Array, *, goal: jax.Array) -> Trials:
+def measure(ended: Episode, position: jax.Array, success: jax.Array, *, goal: jax.Array) -> Trials:
     """What E episodes took, from `position` [T + 1, E, d] and `success` [T + 1, E] at every moment.
 
     As in the statistics of episodes, the moment before the first step does not count as success.

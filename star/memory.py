@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from star.agent import state as states
+from star.agent import levels
 from star.config.section import ConfigError
 from star.program import Program
 
@@ -57,9 +57,10 @@ def _passing(program: Program) -> dict[str, int]:
         found["tutor.correction_candidates"] = seeds * _activations(rows, hidden[:1])
     if near.enabled:
         found["tutor.adjacency"] = seeds * _activations(near.batch_size, (*near.hidden, near.features))
-    examples = dict(zip(("tutor", "controller"), states.examples(config.agent(), program.spec), strict=True))
+    agent = levels.of(config.agent(), program.spec)
     for name, level, rollout in config.learners():
-        found[f"{name}, trainer.num_envs"] = seeds * rollout.size * _bytes(examples[name])
+        example = getattr(agent, name).example(level, agent.task)
+        found[f"{name}, trainer.num_envs"] = seeds * rollout.size * _bytes(example)
         found[f"{name}.{level.group}"] = seeds * level.settings.scratch_bytes(rollout)
     return found
 

@@ -16,10 +16,9 @@ from jax.sharding import Mesh
 import envs
 from envs import arena
 from envs.vector import VectorEnv
-from star import devices, learners
-from star.agent import epoch as hierarchy
-from star.agent import play as episode
-from star.agent import state as states
+from star import devices, faults, learners
+from star.agent import checks, levels, play
+from star.agent import epoch as learning
 from star.agent.play import Episode
 from star.agent.sections import AgentConfig, Config
 from star.agent.state import TrainState
@@ -112,7 +111,7 @@ def build(config: Config) -> Program:
     spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
     config = resolve(config, env.engine, spec)
     try:
-        states.check(config, spec)
+        checks.check(config, spec)
     except ValueError as error:
         raise ConfigError(str(error)) from None
     mesh = devices.mesh(config.trainer.devices)
@@ -131,18 +130,19 @@ def build(config: Config) -> Program:
         return tuple(_demonstrations(config, teacher, env, test_env, spec) for teacher in config.sgim.teachers)
 
     def init(agent: AgentConfig, keys: jax.Array) -> Any:
-        return jax.vmap(lambda one, key: states.init(one, spec, key=key), in_axes=(_axis(agent), 0))(agent, keys)
+        return jax.vmap(lambda one, key: levels.init(one, spec, key=key), in_axes=(_axis(agent), 0))(agent, keys)
 
     def epoch(agent: AgentConfig, lessons: Any, state: TrainState) -> Any:
         def one_epoch(one: AgentConfig, state: TrainState) -> Any:
-            return hierarchy.epoch(one, spec, trained, state, teachers=lessons)
+            state, metrics = learning.epoch(one, spec, trained, state, teachers=lessons)
+            return state, metrics | faults.count(state)
 
         state, metrics = jax.vmap(one_epoch, in_axes=(_axis(agent), 0))(agent, state)
         return _as_on_first(state, placement), metrics
 
     def evaluate(agent: AgentConfig, state: TrainState, keys: jax.Array) -> Any:
         def one_evaluation(one: AgentConfig, state: TrainState, key: jax.Array) -> Any:
-            played = episode.evaluate(one, on_test, tested, state, key=key)
+            played = play.evaluate(one, on_test, tested, state, key=key)
             return jax.tree.map(lambda x: x[:episodes], devices.whole(played))
 
         return jax.vmap(one_evaluation, in_axes=(_axis(agent), 0, 0))(agent, state, keys)

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from envs.vector import VectorEnv
 from star import program as programs
-from star.agent import play as episode
+from star.agent.play import greedy
 from star.agent.sections import Config
 from star.checkpoint import load_agent
 from star.config.section import ConfigError
@@ -76,7 +76,7 @@ def play(
         return Moments(obs=env_state.obs, success=env_state.metrics["success"])
 
     def run(agent: Any, state: Any, key: jax.Array) -> Moments:
-        streams, moments = episode.play(
+        streams, moments = greedy(
             agent,
             spec,
             vector,

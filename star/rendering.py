@@ -24,9 +24,9 @@ from envs.topdown import Sheet, tiled
 from envs.vector import VectorEnv
 from star import assessment
 from star import program as programs
-from star.agent import play as episode
+from star.abstraction.regions import Box
+from star.agent.play import greedy
 from star.agent.sections import Config
-from star.agent.tutor import Box
 from star.assessment import Exam
 from star.checkpoint import agent_number, load_state
 from star.config.section import ConfigError
@@ -182,7 +182,7 @@ def record_run(
         return look(env_state).replace(subgoal=aim[shown], lower=box.lower[shown], upper=box.upper[shown])
 
     def play(agent: Any, state: Any, key: jax.Array) -> tuple[Moments, Moments]:
-        streams, moments = episode.play(agent, spec, vector, state, goals=course.goals, record=record, key=key)
+        streams, moments = greedy(agent, spec, vector, state, goals=course.goals, record=record, key=key)
         end = look(streams.env)
         return moments, end.replace(subgoal=moments.subgoal[-1], lower=moments.lower[-1], upper=moments.upper[-1])
 

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from star.abstraction.regions import locate
-from star.agent import commander
-from star.agent import play as episode
+from star.agent import commander, values
+from star.agent.decisions import Roadmap
 from star.agent.sections import AgentConfig
 from star.agent.state import TrainState
 from star.evaluation import MEASURES
@@ -72,8 +72,9 @@ def _tables(config: AgentConfig, goal: Array, states: TrainState, episode_length
 
 def _table(config: AgentConfig, goal: Array, episode_length: int, state: TrainState) -> dict[str, Array]:
     goal_region = locate(state.abstraction, goal)
-    settled = episode.settled(config, state, episode_length=episode_length)
-    value, target = commander.towards(settled, episode.successors(config, state), goal_region)
+    roadmap = Roadmap.of(config.commander, state.abstraction, state.graph)
+    settled = commander.settle(config.commander, state.commander, roadmap, episode_length=episode_length)
+    value, target = values.towards(settled, roadmap.allowed, goal_region)
     tables = {
         "lower": state.abstraction.lower,
         "upper": state.abstraction.upper,

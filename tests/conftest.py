@@ -15,6 +15,7 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 from dataclasses import replace  # noqa: E402
 from types import SimpleNamespace  # noqa: E402
+from typing import Any, NamedTuple  # noqa: E402
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -28,9 +29,8 @@ from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
 from star import loading  # noqa: E402
 from star import program as programs  # noqa: E402
-from star.agent import epoch as hierarchy
-from star.agent import play as episode  # noqa: E402
-from star.agent import state as states  # noqa: E402
+from star.agent import commander, controller, levels, play, tutor  # noqa: E402
+from star.agent.decisions import Roadmap  # noqa: E402
 from star.checkpoint import Checkpoints  # noqa: E402
 from star.spec import Spec  # noqa: E402
 from tests.browser import program, started
@@ -99,7 +99,7 @@ class Fused:
         return jnp.zeros((), bool)
 
 
-LONGEST = ("test_trainer.py", "test_hierarchy.py", "test_strategies.py")
+LONGEST = ("test_trainer.py", "test_epoch.py", "test_strategies.py")
 
 
 def pytest_collection_modifyitems(items):
@@ -170,39 +170,58 @@ def turning(breaking_env):
     return replace(Spec.of(breaking_env.env, heading=2.0), orientation=(0, 1, 2, 3))
 
 
-def record(agent, spec, env, state, key):
-    """Every intermediate value of one episode, segment by segment; leading axis [segments]."""
+class Steps(NamedTuple):
+    """A segment with both ends of each of its env steps, [l, B]."""
 
-    def segment(streams, key):
-        command_key, tutor_key, rollout_key, reset_key = jax.random.split(key, 4)
-        allowed = episode.successors(agent, state)
-        before = streams
-        commanded = episode.command(agent, spec, state, allowed, before, epsilon=0.5, key=command_key)
-        subgoal, action = episode.choose_subgoal(agent, spec, state, commanded, deterministic=False, key=tutor_key)
-        rolled, steps = episode.rollout(
-            agent, spec, env, state, commanded, subgoal, deterministic=False, key=rollout_key
-        )
-        advanced = episode.advance(agent, rolled)
-        decision, outcome = hierarchy.finished_period(agent, spec, state, advanced, steps)
+    obs: Any
+    next_obs: Any
+    subgoal: Any
+    next_subgoal: Any
+    alive: Any
+    ended: Any
+    terminated: Any
+    non_finite: Any
+    success: Any
+    distance: Any
+
+    @classmethod
+    def of(cls, passed):
+        """Those of a `star.agent.segments.Segment`."""
+        same = {name: getattr(passed, name) for name in cls._fields if hasattr(passed, name)}
+        ends = {name: getattr(passed, name)[:-1] for name in ("obs", "subgoal")}
+        return cls(**same | ends, next_obs=passed.obs[1:], next_subgoal=passed.subgoal[1:])
+
+
+def record(config, spec, env, state, key):
+    """Every intermediate value of one episode, segment by segment; leading axis [segments]."""
+    agent = levels.of(config, spec)
+    roadmap = Roadmap.of(config.commander, state.abstraction, state.graph)
+    nobody = jnp.zeros(())
+
+    def segment(before, key):
+        *keys, reset_key = jax.random.split(key, 4)
+        rolled, passed, marks = play.segment(agent, env, state, roadmap, before, env_steps=nobody, keys=keys)
+        memory, finished = commander.experience(config.commander, agent.task, roadmap, rolled.memory, passed, marks)
+        renewed = commander.renewed(memory)
+        advanced = rolled.replace(memory=memory)
         saved = {
             "before": before,
-            "commanded": commanded,
-            "subgoal": subgoal,
+            "commanded": rolled.memory,
+            "subgoal": passed.choice.subgoal,
             "rolled": rolled,
-            "steps": steps,
+            "steps": Steps.of(passed),
+            "passed": passed,
             "advanced": advanced,
-            "decision": decision,
-            "outcome": outcome,
-            "tutor": hierarchy._tutor_transition(agent, spec, advanced, before.env.obs, action, steps),
-            "controller": hierarchy._controller_rollout(agent, spec, steps, env_steps=0.0),
+            "decision": finished.decision,
+            "outcome": finished.outcome,
+            "tutor": tutor.experience(config.tutor, agent.task, passed, marks, renewed=renewed),
+            "controller": controller.experience(config.controller, agent.task, passed, env_steps=0.0),
         }
-        return episode.restart_ended(spec, env, advanced, steps, key=reset_key), saved
+        return play.restart_ended(agent, env, advanced, passed, key=reset_key), saved
 
     start_key, scan_key = jax.random.split(key)
-    streams = episode.start(spec, env, practice=0.6, key=start_key)
-    keys = jax.random.split(scan_key, spec.episode_length // agent.tutor.period)
-    last, saved = jax.lax.scan(segment, streams, keys)
-    return last, saved
+    streams = play.start(agent, env, key=start_key)
+    return jax.lax.scan(segment, streams, jax.random.split(scan_key, spec.episode_length // config.tutor.period))
 
 
 @pytest.fixture(scope="session", params=["published", "ours"])
@@ -216,12 +235,15 @@ def recording(request, breaking_env):
         "tutor.relative_bounds": not published,
         "tutor.reward_scale": 0.1,
         "controller.reward_scale": 0.5,
+        "commander.practice": 0.6,
+        "commander.epsilon_start": 0.5,
+        "commander.epsilon_spread": False,
     }
     parsed = loading.parse(TINY, overrides)
     agent, spec = parsed.agent(), Spec.of(breaking_env.env)
 
     def whole(key):
-        state = states.init(agent, spec, key=key)
+        state = levels.init(agent, spec, key=key)
         # Greedy choices often fall on the goal's own region.
         eye = jnp.eye(state.abstraction.capacity)
         q = jnp.broadcast_to(eye, state.commander.q.shape)

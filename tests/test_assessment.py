@@ -13,7 +13,6 @@ import pytest
 
 from star import assessment, checkpoint, cli, loading, rendering, report, tables
 from star import program as programs
-from star.agent import play as episode
 from star.agent.play import Episode
 from star.assessment import Exam, Target
 from star.checkpoint import Checkpoints, load_state
@@ -47,7 +46,7 @@ def still(run, tmp_path_factory):
 @pytest.fixture(scope="module")
 def evaluated(run, still):
     """The rows of both runs on a grid of goals, how often the episode was traced, and the trials of every row."""
-    traced, play, trials, row = [], episode.play, [], assessment._row
+    traced, play, trials, row = [], assessment.greedy, [], assessment._row
 
     def kept(entry, exam, played, shortest):
         trials.append(played)
@@ -58,7 +57,7 @@ def evaluated(run, still):
         return play(*arguments, **how)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(episode, "play", counted)
+        patch.setattr(assessment, "greedy", counted)
         patch.setattr(assessment, "_row", kept)
         targets = [Target(run, "last", config_of(run)), Target(still, "all", config_of(still))]
         rows = assessment.evaluate([*targets, Target(still, "best", config_of(still))], GRID)

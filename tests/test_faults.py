@@ -17,8 +17,8 @@ from rich.console import Console
 import envs
 from star import checkpoint, cli, debugging, faults, trainer
 from star import program as programs
-from star.agent import epoch as hierarchy
-from star.agent import state as states
+from star.agent import epoch as learning
+from star.agent import levels
 from star.agent.play import Episode
 from star.loading import parse
 from star.metrics import Journal, of_epoch
@@ -55,8 +55,13 @@ def epoch():
     env = envs.make("point_maze", engine="jax", episode_length=60)
     agent, spec = ALL_LEVELS.agent(), Spec.of(env)
     batch = Fragile(env, ALL_LEVELS.trainer.num_envs, auto_reset=False)
-    init = jax.jit(jax.vmap(lambda key: states.init(agent, spec, key=key)))
-    one = jax.jit(jax.vmap(lambda state: hierarchy.epoch(agent, spec, batch, state, teachers=())))
+    init = jax.jit(jax.vmap(lambda key: levels.init(agent, spec, key=key)))
+
+    def counted(state):
+        state, metrics = learning.epoch(agent, spec, batch, state, teachers=())
+        return state, metrics | faults.count(state)
+
+    one = jax.jit(jax.vmap(counted))
     fresh, _ = one(init(jax.random.split(jax.random.key(0), len(SEEDS))))  # with something in its rings
 
     def run(change=lambda state: state):
@@ -314,10 +319,10 @@ debugging.turn_on()
 import jax
 assert jax.config.jax_debug_nans
 from star import program
-from star.agent import epoch
+from star.abstraction import refinement
 from star.loading import parse
 from tests.small import RUN
-assert hasattr(epoch.refine, "__wrapped__")
+assert hasattr(refinement.refine, "__wrapped__")
 built = program.build(parse(RUN))
 state = jax.eval_shape(built.init, built.seed_keys())
 jax.eval_shape(built.epoch, state)

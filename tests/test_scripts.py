@@ -21,8 +21,8 @@ from star import program as programs
 from star.abstraction import reachability
 from star.abstraction.forward_model import Outcome
 from star.abstraction.reachability import MISSES, REACHES
-from star.agent import state as states
-from star.agent.commander import Decision
+from star.agent import levels
+from star.agent.decisions import Decision
 from star.checkpoint import Checkpoints, Damaged
 from star.evaluation import bootstrap
 from star.learners import replay
@@ -212,7 +212,7 @@ def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
     script = load("verify_abstraction")
     spec = Spec.of(breaking_env.env)
     agent = loading.parse(tiny, {"abstraction.cuts": [[8.0], [8.0]]}).agent()
-    state = states.init(agent, spec, key=jax.random.key(0))
+    state = levels.init(agent, spec, key=jax.random.key(0))
     verdict = state.graph.verdict.at[0, 1].set(REACHES).at[1, 0].set(MISSES)
     state = state.replace(graph=state.graph.replace(verdict=verdict))
     # (region, target, next region): 0 -> 1 is right in 3 of 4 rollouts, 1 -> 0 in 1 of 2, and one does not count.
@@ -266,7 +266,7 @@ def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_
     agent = loading.parse(
         tiny, {"abstraction.cuts": [[8.0], [8.0]], "refinement.parts": 8, "refinement.depth": 3}
     ).agent()
-    state = states.init(agent, spec, key=jax.random.key(0))
+    state = levels.init(agent, spec, key=jax.random.key(0))
     layer = state.forward_model.params["params"]["Dense_1"]
     moving = {"kernel": 0.1 * layer["kernel"], "bias": jax.numpy.array([1.0, 0.0])}
     params = {"params": {**state.forward_model.params["params"], "Dense_1": moving}}
@@ -359,3 +359,36 @@ def test_odd_configs_are_accepted_or_refused_in_one_line_and_leave_nothing_behin
 def test_the_fuzzer_notices_what_is_wrong(fuzz, monkeypatch, does, ended):
     monkeypatch.setattr(fuzz.cli, "main", lambda words: does())
     assert fuzz.run(fuzz.Case("", (), {"config.yaml": b""}), limit=1).ended == ended
+
+
+CHECK = load("checks/same_learning")
+
+
+def test_every_layer_has_a_row_in_the_check_of_learning():
+    there = {f"{folder}/{path.stem}" for folder in CHECK.FOLDERS for path in Path("configs", folder).glob("*.yaml")}
+    assert there == CHECK.ROWS.keys() and len(there) > 30
+
+
+@pytest.mark.parametrize("name", CHECK.ROWS)
+def test_each_layer_changes_a_setting_of_the_task_on_which_it_is_compared(name):
+    row = CHECK.ROWS[name]
+    task = f"configs/{row.config}.yaml"
+    without = loading.load(task, row.settings, layers=[f"configs/{layer}.yaml" for layer in row.below])
+    layers = [f"configs/{layer}.yaml" for layer in (*row.below, name)]
+    assert loading.load(task, row.settings, layers=layers) != without
+
+
+def test_the_check_of_learning_tells_a_bit_from_rounding_and_rounding_from_more():
+    whole, real = np.arange(3), np.array([1.0, 1e-3, np.nan], np.float32)
+    old = {"count": whole, "weight": real}
+    for new, different, far in (
+        ({}, 0, 0),
+        ({"weight": real + np.float32(1e-7)}, 1, 0),
+        ({"weight": real + np.float32(2e-5)}, 1, 1),
+        ({"weight": np.array([1.0, 1e-3, 0.0], np.float32)}, 1, 1),
+        ({"weight": -real}, 1, 1),
+        ({"count": whole + 1}, 1, 1),
+        ({"more": whole}, 1, 1),
+    ):
+        assert len(CHECK.bits(old, old | new)) == different
+        assert len(CHECK.rounding(old, old | new)) == far

@@ -21,6 +21,7 @@ Source: STAR (ICLR 2024), section 4.3 and algorithm 2.
 from __future__ import annotations
 
 from functools import partial
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -31,10 +32,26 @@ from envs.common.batching import where
 from star.abstraction import forward_model, reachability, regions
 from star.abstraction.forward_model import ForwardModelState, Outcome
 from star.abstraction.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves
-from star.abstraction.regions import Abstraction, Cut
-from star.agent.sections import AgentConfig
+from star.abstraction.regions import Abstraction, Change, Cut, Split
+from star.abstraction.sections import AbstractionConfig, ForwardModelConfig, RefinementConfig
 
 Metrics = dict[str, Array]
+
+
+class Settings(Protocol):
+    """The sections that this is about; those of an agent have them."""
+
+    @property
+    def abstraction(self) -> AbstractionConfig:
+        """The table of regions."""
+
+    @property
+    def forward_model(self) -> ForwardModelConfig:
+        """What predicts where commands lead."""
+
+    @property
+    def refinement(self) -> RefinementConfig:
+        """When and where regions are cut."""
 
 
 class Graph(struct.PyTreeNode):
@@ -109,7 +126,7 @@ def tell(
 
 
 def observe(
-    config: AgentConfig,
+    config: Settings,
     graph: Graph,
     *,
     region: Int[Array, "N"],
@@ -129,7 +146,7 @@ def observe(
     )
 
 
-def forget(config: AgentConfig, graph: Graph) -> Graph:
+def forget(config: Settings, graph: Graph) -> Graph:
     """Let one epoch pass: MISSES verdicts older than `miss_lifetime` become unknown and must earn examination anew."""
     age = graph.age + 1
     expired = graph.misses & (age > config.refinement.miss_lifetime)
@@ -140,7 +157,7 @@ def forget(config: AgentConfig, graph: Graph) -> Graph:
     )
 
 
-def due(config: AgentConfig, graph: Graph, active: Bool[Array, "R"]) -> Bool[Array, "R R"]:
+def due(config: Settings, graph: Graph, active: Bool[Array, "R"]) -> Bool[Array, "R R"]:
     """The pairs that pass the gate."""
     pairs = active[:, None] & active[None, :]
     if not config.refinement.within:
@@ -200,21 +217,8 @@ def random_cut(abstraction: Abstraction, region: Int[Array, ""], *, min_width: f
     return Cut(region=region, dimension=dimension, position=position)
 
 
-class Split(struct.PyTreeNode):
-    """A cut that was made (`done`) or not, and the region that is new by it."""
-
-    done: Bool[Array, ""]
-    cut: Cut
-    child: Int[Array, ""]
-
-    @property
-    def parent(self) -> Int[Array, "*splits"]:
-        """The region that was cut."""
-        return self.cut.region
-
-
 def refine(
-    config: AgentConfig,
+    config: Settings,
     abstraction: Abstraction,
     graph: Graph,
     model: ForwardModelState,
@@ -223,14 +227,14 @@ def refine(
     radius: float | Array,
     weight: Float[Array, "R"] | float = 1.0,
     key: Array,
-) -> tuple[Abstraction, Graph, Split, Metrics]:
+) -> tuple[Graph, Change, Metrics]:
     """Examine the due pairs of one epoch, at most `pairs_per_epoch`, and cut where a verdict is mixed.
 
     `radius` is that of success around goals. Of the due pairs, those commanded most and waiting longest come first;
-    `weight` multiplies the urgency of those that lead to each region. Returns the splits in the order made, stacked
-    [pairs_per_epoch * cuts_per_pair], for tables indexed by region.
+    `weight` multiplies the urgency of those that lead to each region. Returns the graph of the new regions, and the
+    change that tables indexed by region have to follow, with [pairs_per_epoch * cuts_per_pair] splits.
     """
-    graph = forget(config, graph)
+    graph, before = forget(config, graph), abstraction
     starts, seen = forward_model.visited(model)
 
     def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
@@ -272,11 +276,11 @@ def refine(
         "misses": graph.misses.sum(),
         "table_full": (abstraction.count == abstraction.capacity).astype(jnp.int32),
     }
-    return abstraction, graph, splits, metrics
+    return graph, Change.of(before, abstraction, splits), metrics
 
 
 def _most_urgent(
-    config: AgentConfig, abstraction: Abstraction, graph: Graph, weight: Float[Array, "R"] | float
+    config: Settings, abstraction: Abstraction, graph: Graph, weight: Float[Array, "R"] | float
 ) -> tuple[Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
     """The pair to examine next, region and target, and whether any is due."""
     waiting = due(config, graph, abstraction.active)
@@ -335,7 +339,7 @@ def _draw_goal(
 
 
 def _examine(
-    config: AgentConfig,
+    config: Settings,
     abstraction: Abstraction,
     model: ForwardModelState,
     region: Array,
@@ -359,7 +363,7 @@ def _examine(
 
 
 def _cut(
-    config: AgentConfig,
+    config: Settings,
     abstraction: Abstraction,
     graph: Graph,
     region: Array,

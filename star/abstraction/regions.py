@@ -13,7 +13,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -49,6 +48,66 @@ class Cut(NamedTuple):
     region: Int[Array, ""]
     dimension: Int[Array, ""]
     position: Float[Array, ""]
+
+
+class Split(struct.PyTreeNode):
+    """A cut that was made (`done`) or not, and the region that is new by it."""
+
+    done: Bool[Array, "*splits"]
+    cut: Cut
+    child: Int[Array, "*splits"]
+
+    @property
+    def parent(self) -> Int[Array, "*splits"]:
+        """The region that was cut."""
+        return self.cut.region
+
+
+class Change(struct.PyTreeNode):
+    """What became of the regions between two episodes: all that has a table of them follows it."""
+
+    before: Abstraction
+    after: Abstraction
+    splits: Split
+    """In the order in which they were made."""
+    origin: Int[Array, "R"]
+    """The region of `before` that each region of `after` is, or was cut from; of those not in use their own index."""
+
+    @classmethod
+    def of(cls, before: Abstraction, after: Abstraction, splits: Split) -> Change:
+        """The change that `splits` [N] made."""
+
+        def follow(origin: Array, split: Split) -> tuple[Array, None]:
+            return jnp.where(split.done, origin.at[split.child].set(origin[split.parent]), origin), None
+
+        origin = jax.lax.scan(follow, jnp.arange(after.capacity), splits)[0]
+        return cls(before=before, after=after, splits=splits, origin=origin)
+
+
+class Box(struct.PyTreeNode):
+    """Boxes in the abstract dimensions, lower and upper corners [..., d]."""
+
+    lower: Float[Array, "*batch d"]
+    upper: Float[Array, "*batch d"]
+
+    @classmethod
+    def around(cls, point: Float[Array, "*batch d"], margin: float | Array) -> Box:
+        """The box of half-width `margin` with `point` at its centre."""
+        return cls(lower=point - margin, upper=point + margin)
+
+    @property
+    def centre(self) -> Float[Array, "*batch d"]:
+        """The point in the middle."""
+        return (self.lower + self.upper) / 2
+
+    @property
+    def corners(self) -> Float[Array, "*batch m"]:
+        """Both corners as one vector."""
+        return jnp.concatenate([self.lower, self.upper], axis=-1)
+
+    def seen_from(self, origin: Float[Array, "*batch d"]) -> Box:
+        """The box relative to `origin`."""
+        return Box(lower=self.lower - origin, upper=self.upper - origin)
 
 
 def create(space: tuple[ArrayLike, ArrayLike], cuts: Sequence[Sequence[float]], *, max_regions: int) -> Abstraction:
@@ -133,12 +192,6 @@ def adjacent(abstraction: Abstraction) -> Bool[Array, "R R"]:
     upper = jnp.minimum(abstraction.upper[:, None], abstraction.upper[None])
     faces = jnp.all(lower <= upper, axis=-1) & (jnp.sum(lower < upper, axis=-1) == lower.shape[-1] - 1)
     return faces & abstraction.active[:, None] & abstraction.active[None]
-
-
-def origins(before: Abstraction, after: Abstraction) -> Int[Array, "R"]:
-    """The region of `before` out of which each region of `after`, made of it by splits, was cut; else its own index."""
-    cut_from = jax.vmap(partial(locate, before))(after.lower)
-    return jnp.where(after.active, cut_from, jnp.arange(after.capacity))
 
 
 def inherit(table: Array, *, parent: Array, child: Array, axes: Sequence[int]) -> Array:

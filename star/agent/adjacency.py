@@ -22,8 +22,11 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from star.agent.sections import AdjacencyConfig
+from star.agent import tutor
+from star.agent.sections import AdjacencyConfig, TutorConfig
+from star.agent.task import Task
 from star.learners.networks import MLP, apply, descend
+from star.learners.replay import Penalty, Transition
 
 Metrics = dict[str, Array]
 
@@ -44,8 +47,12 @@ def shape(config: AdjacencyConfig, space: tuple[tuple[float, ...], tuple[float, 
     return tuple(max(int(np.ceil(side / config.cell)), 1) for side in sides)
 
 
-def init(key: Array, config: AdjacencyConfig, space: tuple[tuple[float, ...], tuple[float, ...]]) -> AdjacencyState:
-    """Nothing known, an untrained network."""
+def init(
+    key: Array, config: AdjacencyConfig, space: tuple[tuple[float, ...], tuple[float, ...]]
+) -> AdjacencyState | None:
+    """Nothing known, an untrained network; None where it is not asked for."""
+    if not config.enabled:
+        return None
     count = int(np.prod(shape(config, space)))
     params = _mlp(config).init(key, jnp.zeros(len(space[0])))
     return AdjacencyState(
@@ -65,12 +72,14 @@ def locate(
 
 def observe(
     config: AdjacencyConfig,
-    state: AdjacencyState,
+    state: AdjacencyState | None,
     space: tuple[tuple[float, ...], tuple[float, ...]],
     path: Float[Array, "states B d"],
     alive: Float[Array, "l B"],
-) -> AdjacencyState:
+) -> AdjacencyState | None:
     """Cells that an agent visited within the same l env steps are adjacent; `alive` masks steps after its end."""
+    if state is None:
+        return None
     cell = locate(config, space, path)
     valid = jnp.concatenate([jnp.ones_like(alive[:1]), alive]) > 0
     first, second = np.triu_indices(path.shape[0], 1)
@@ -108,6 +117,19 @@ def train(
     )
     share = state.adjacent.sum() / jnp.maximum(jnp.square(visited.sum()), 1)
     return state.replace(params=params, optimizer=optimizer), {"loss": mean_loss, "share": share}
+
+
+def price(section: TutorConfig, task: Task, state: AdjacencyState | None) -> Penalty | None:
+    """The price of subgoals in a batch of the Tutor's, by how far they are out of reach; None if there is none."""
+    if state is None:
+        return None
+    spec, d = task.spec, len(task.spec.abstract_indices)
+
+    def of(batch: Transition, action: Array) -> Float[Array, "N"]:
+        start, way = tutor.began(section, batch)[..., :d], (action * spec.scale)[..., :d]
+        return penalty(section.adjacency, state, start, way)
+
+    return of
 
 
 def penalty(

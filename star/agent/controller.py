@@ -6,70 +6,127 @@
     reward  = -||s_t + g_t - s_{t+1}||  (`distance`, published)   or   ||g_t|| - ||g_{t+1}||  (`progress`)
               less a penalty for the tilt of the body, and one where the task is terminated
 
-Without a Tutor the subgoal is the target box itself, its lower and upper corner relative to s, [2d] numbers, and
-||.|| is the distance to the box, as in GARA (Zadem, Mover and Nguyen 2023).
+    act         at every env step
+    experience  a segment of l env steps under one subgoal, of which it learns at once
 
 Source: STAR (ICLR 2024), section 4.1, after HIRO (Nachum et al. 2018), section 3.2.
 """
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from envs.common.batching import where
+from star import learners
 from star.agent.sections import ControllerConfig
+from star.agent.segments import Policy, Segment
+from star.agent.task import Task
+from star.learners.replay import Imitation, Transition, weighted_mean
+from star.sgim.lessons import Shown
 from star.spec import Spec
+
+Metrics = dict[str, Array]
+
+
+def init(key: Array, section: ControllerConfig, task: Task) -> Any:
+    """The state of its learner, before it has learnt."""
+    return learners.init(key, section, example=example(section, task))
+
+
+def example(section: ControllerConfig, task: Task) -> Transition:
+    """The shapes of one transition."""
+    spec, scalar = task.spec, jnp.zeros(())
+    seen = observe(section, task, jnp.zeros(spec.state_dim), jnp.zeros(task.subgoals.size))
+    return Transition(
+        obs=seen,
+        action=jnp.zeros(spec.action_size),
+        reward=scalar,
+        next_obs=seen,
+        terminated=scalar,
+        cut=scalar,
+        weight=scalar,
+        extras=jnp.zeros((2, len(spec.scale))) if section.hindsight else (),
+    )
 
 
 def observe(
-    config: ControllerConfig, spec: Spec, state: Float[Array, "*batch state"], subgoal: Float[Array, "*batch m"]
+    section: ControllerConfig, task: Task, state: Float[Array, "*batch state"], subgoal: Float[Array, "*batch m"]
 ) -> Float[Array, "*batch seen"]:
     """The state without its abstract coordinates, followed by the relative subgoal, both in the axes of `frame`.
 
-    A box turned with the body is no box: it is given by its nearest point and its centre instead of its corners. What
-    a full state holds of blocks stays in the world's axes.
+    What a full state holds of blocks stays in the world's axes.
     """
-    if config.frame == "body":
-        if subgoal.shape[-1] != len(spec.scale):
-            centre = sum(jnp.split(subgoal, 2, axis=-1)) / 2
-            subgoal = jnp.concatenate([nearest(subgoal, size=len(spec.scale)), centre], axis=-1)
-        state, subgoal = spec.turned(state, subgoal)
-    kept = np.setdiff1d(np.arange(state.shape[-1]), np.asarray(spec.abstract_indices, int))
+    if section.frame == "body":
+        state, subgoal = task.spec.turned(state, task.subgoals.ways(subgoal))
+    kept = np.setdiff1d(np.arange(state.shape[-1]), np.asarray(task.spec.abstract_indices, int))
     return jnp.concatenate([state[..., kept], subgoal], axis=-1)
 
 
-def next_subgoal(
-    subgoal: Float[Array, "*batch m"], achieved: Float[Array, "*batch d"], next_achieved: Float[Array, "*batch d"]
-) -> Float[Array, "*batch m"]:
-    """The same subgoal seen from where the agent is now: h(s, g, s') = s + g - s'."""
-    moved = jnp.tile(next_achieved - achieved, subgoal.shape[-1] // achieved.shape[-1])
-    return subgoal - moved
+def act(
+    section: ControllerConfig, state: Any, seen: Float[Array, "*batch seen"], *, explore: bool, key: Array
+) -> Float[Array, "*batch act"]:
+    """Actions for what is `seen`; the environment clips them to [-1, 1]."""
+    return learners.act(section, state, seen, deterministic=not explore, key=key)
 
 
-def nearest(subgoal: Float[Array, "*batch m"], *, size: int) -> Float[Array, "*batch size"]:
-    """A subgoal of `size` = d coordinates, or the nearest point of a box given by two corners."""
-    if subgoal.shape[-1] == size:
-        return subgoal
-    lower, upper = jnp.split(subgoal, 2, axis=-1)
-    return jnp.maximum(lower, 0.0) + jnp.minimum(upper, 0.0)
+def policy(section: ControllerConfig, task: Task, state: Any, *, key: Array) -> Policy:
+    """What it does in states [..., state] under subgoals [..., m], without exploration."""
+
+    def actions(states: Array, subgoals: Array) -> Array:
+        return act(section, state, observe(section, task, states, subgoals), explore=False, key=key)
+
+    return actions
 
 
-def distance(subgoal: Float[Array, "*batch m"], *, size: int) -> Float[Array, "*batch"]:
-    """Distance to a subgoal of `size` = d coordinates, or to a box given by two corners."""
-    return jnp.linalg.norm(nearest(subgoal, size=size), axis=-1)
+def experience(
+    section: ControllerConfig, task: Task, segment: Segment, *, env_steps: Float[Array, ""] | float
+) -> Transition:
+    """What a segment teaches, [l, B]; `env_steps` are those of all environments before the epoch."""
+    last = jnp.zeros_like(segment.alive).at[-1].set(1.0)
+    before, after = segment.subgoal[:-1], segment.subgoal[1:]
+    lost = price(section, task.spec, segment.obs[1:], segment.terminated, env_steps=env_steps)
+    return Transition(
+        obs=segment.seen[:-1],
+        action=segment.action,
+        reward=reward(section, task, before, after) - lost,
+        next_obs=segment.seen[1:],
+        terminated=segment.terminated,
+        cut=jnp.maximum(last, segment.ended),
+        weight=segment.alive,
+        extras=_later(task, segment) if section.hindsight else (),
+    )
+
+
+def learn(
+    section: ControllerConfig, task: Task, state: Any, batch: Transition, *, shown: Shown | None, key: Array
+) -> tuple[Any, Metrics]:
+    """Learn from a segment, and from the actions that teachers have `shown`."""
+    imitation = None
+    if shown is not None:
+        subgoal = task.subgoals.demonstrated(task.spec, shown.state, shown.later, shown.outcome)
+        seen = observe(section, task, shown.state, subgoal)
+        imitation = Imitation(obs=seen, action=shown.action, weight=shown.weight)
+    relabel = partial(_in_hindsight, section, task) if section.hindsight else None
+    state, metrics = learners.update(section, state, batch, relabel=relabel, imitation=imitation, key=key)
+    return state, metrics | {"reward": weighted_mean(batch.reward, batch.weight)}
 
 
 def reward(
-    config: ControllerConfig, subgoal: Float[Array, "*batch m"], next_subgoal: Float[Array, "*batch m"], *, size: int
+    section: ControllerConfig, task: Task, subgoal: Float[Array, "*batch m"], next_subgoal: Float[Array, "*batch m"]
 ) -> Float[Array, "*batch"]:
-    """Reward of one env step from the relative subgoals before and after it, of `size` = d coordinates or boxes."""
-    before, after = distance(subgoal, size=size), distance(next_subgoal, size=size)
-    return config.reward_scale * (-after if config.reward == "distance" else before - after)
+    """Reward of one env step from the relative subgoals before and after it."""
+    before, after = task.subgoals.distance(subgoal), task.subgoals.distance(next_subgoal)
+    return section.reward_scale * (-after if section.reward == "distance" else before - after)
 
 
 def price(
-    config: ControllerConfig,
+    section: ControllerConfig,
     spec: Spec,
     next_obs: Float[Array, "*batch obs"],
     terminated: Float[Array, "*batch"],
@@ -81,8 +138,29 @@ def price(
     The share of `tilt_penalty` rises exponentially over the first `tilt_steps` of `env_steps`, those of all
     environments together.
     """
-    lost = config.termination_penalty * terminated
+    lost = section.termination_penalty * terminated
     if not spec.orientation:
         return lost
-    share = config.tilt_start ** jnp.maximum(1.0 - env_steps / config.tilt_steps, 0.0)
-    return lost + share * config.tilt_penalty * spec.tilt(next_obs)
+    share = section.tilt_start ** jnp.maximum(1.0 - env_steps / section.tilt_steps, 0.0)
+    return lost + share * section.tilt_penalty * spec.tilt(next_obs)
+
+
+def _later(task: Task, segment: Segment) -> Float[Array, "l B 2 p"]:
+    """Where the agent was at the end of the segment, seen from before and from after each of its env steps."""
+    pose = task.spec.pose(segment.obs)
+    return jnp.stack([pose[-1] - pose[:-1], pose[-1] - pose[1:]], axis=-2)
+
+
+def _in_hindsight(section: ControllerConfig, task: Task, batch: Transition, key: Array) -> Transition:
+    """Half of the replayed transitions as if what the agent reached had been its subgoal (Andrychowicz et al. 2017)."""
+    size, reached = task.subgoals.size, task.subgoals.asking(batch.extras)
+    before, after = reached[:, 0], reached[:, 1]
+    paid = partial(reward, section, task)
+    lost = paid(batch.obs[:, -size:], batch.next_obs[:, -size:]) - batch.reward  # does not depend on the subgoal
+    replaced = jax.random.bernoulli(key, 0.5, batch.reward.shape)
+    relabelled = batch.replace(
+        obs=batch.obs.at[:, -size:].set(before),
+        next_obs=batch.next_obs.at[:, -size:].set(after),
+        reward=paid(before, after) - lost,
+    )
+    return where(replaced, relabelled, batch)

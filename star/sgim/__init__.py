@@ -18,23 +18,14 @@ from typing import TYPE_CHECKING, Any
 from star.sgim.sections import SelectionConfig as Config
 
 if TYPE_CHECKING:
-    from star.sgim.selection import (
-        Choice,
-        SgimState,
-        init,
-        interest,
-        on_split,
-        probabilities,
-        progress,
-        select,
-        split,
-        update,
-    )
+    from star.sgim.cuts import follow, on_split, split
+    from star.sgim.selection import Choice, SgimState, init, interest, probabilities, progress, select, update
 
 __all__ = [
     "Choice",
     "Config",
     "SgimState",
+    "follow",
     "init",
     "interest",
     "on_split",
@@ -49,6 +40,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'star.sgim' has no attribute {name!r}")
-    value = getattr(importlib.import_module("star.sgim.selection"), name)
+    home = "cuts" if name in ("follow", "on_split", "split") else "selection"
+    value = getattr(importlib.import_module(f"star.sgim.{home}"), name)
     globals()[name] = value
     return value

@@ -33,13 +33,10 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from envs.common.batching import where
-from star.abstraction import regions
-from star.abstraction.regions import Abstraction, Cut
+from star.abstraction.regions import Abstraction
 from star.sgim.sections import SelectionConfig
 
 RANDOM, INTEREST, BEST = 0, 1, 2  # modes of a choice
-QUANTILES = 9  # places where a cut is tried along each dimension
 
 
 class SgimState(struct.PyTreeNode):
@@ -110,13 +107,13 @@ def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[floa
 def progress(state: SgimState) -> Float[Array, "R"]:
     """How much the competence of each region has grown over its window, in units of competence; 0 if inactive."""
     newer, older = _halves(state)
-    grown = _mean(state.competences, newer) - _mean(state.competences, older)
+    grown = mean_where(state.competences, newer) - mean_where(state.competences, older)
     return jnp.where(state.abstraction.active & newer.any(axis=-1), grown, 0.0)
 
 
 def competence(state: SgimState) -> Float[Array, "R"]:
     """Mean of what is remembered of each region; 0 where that is nothing."""
-    return _mean(state.competences, _known(state))
+    return mean_where(state.competences, _known(state))
 
 
 def mastered(state: SgimState) -> Float[Array, "R d"]:
@@ -207,75 +204,6 @@ def update(
     state = _credit(config, state, choice, competences, counted)
     state = _remember(config, state, choice, competences, counted)
     return state.replace(refused=state.refused + jnp.sum(given & ~finite), blocks=state.blocks + 1)
-
-
-def on_split(state: SgimState, abstraction: Abstraction, *, parent: Int[Array, ""], child: Int[Array, ""]) -> SgimState:
-    """Follow a cut of region `parent`, whose upper part is `child` in the new `abstraction`.
-
-    Each remembered goal goes to the part it lies in, in the order in which it was practised. What strategies add holds
-    for both parts. Their first blocks credit nobody: a part that is harder than the whole has not been forgotten.
-    """
-    order, known = _newest_first(state)
-    order, known = order[parent, ::-1], known[parent, ::-1]  # oldest first
-    goals, competences = state.goals[parent, order], state.competences[parent, order]
-    above = jnp.all((abstraction.lower[child] <= goals) & (goals <= abstraction.upper[child]), axis=-1)
-    inherit = lambda table: regions.inherit(table, parent=parent, child=child, axes=(0,))  # noqa: E731
-    state = state.replace(
-        abstraction=abstraction,
-        mean=state.mean.at[jnp.array([parent, child])].set(jnp.nan),
-        shares=inherit(state.shares),
-        gains=inherit(state.gains),
-        doubt=inherit(state.doubt),
-        episodes=inherit(state.episodes.at[parent].multiply(0.5)),
-    )
-    for part, mine in ((parent, known & ~above), (child, known & above)):
-        front = jnp.argsort(~mine, stable=True)
-        state = state.replace(
-            goals=state.goals.at[part].set(goals[front]),
-            competences=state.competences.at[part].set(competences[front]),
-            written=state.written.at[part].set(mine.sum()),
-        )
-    return state
-
-
-def split(config: SelectionConfig, state: SgimState) -> tuple[SgimState, Bool[Array, ""]]:
-    """Make the cut between whose two sides progress differs most, and say whether there was one.
-
-    For use without another owner of the regions. Of the cuts through regions with a full window, at quantiles of their
-    goals along each dimension, with at least `min_side` goals and `min_width` on each side, the one with the largest
-    n1 n2 |P1 - P2| is made (SAGG-RIAC); a side's progress is that between its own older and newer half.
-    """
-    slots, known = (x[:, ::-1] for x in _newest_first(state))  # oldest first
-    goals = jnp.take_along_axis(state.goals, slots[..., None], axis=1)
-    competences = jnp.take_along_axis(state.competences, slots, axis=1)
-    full = state.abstraction.active & (state.written >= config.window)
-
-    def grown(values: Array, side: Array) -> Float[Array, ""]:
-        rank, half = jnp.cumsum(side), side.sum() // 2
-        return _mean(values, side & (rank > side.sum() - half)) - _mean(values, side & (rank <= half))
-
-    def score(region: Array, dimension: Array, position: Array) -> Float[Array, ""]:
-        above = goals[region, :, dimension] >= position
-        sides = [known[region] & side for side in (above, ~above)]
-        sizes = jnp.stack([side.sum() for side in sides])
-        differ = jnp.abs(grown(competences[region], sides[0]) - grown(competences[region], sides[1]))
-        lower, upper = state.abstraction.lower[region, dimension], state.abstraction.upper[region, dimension]
-        wide = jnp.minimum(position - lower, upper - position) >= config.min_width
-        allowed = full[region] & wide & (sizes.min() >= config.min_side) & (differ > 1e-6)  # more than rounding
-        return jnp.where(allowed, sizes.prod() * differ, 0.0)
-
-    shares = jnp.arange(1, QUANTILES + 1) / (QUANTILES + 1)
-    positions = jnp.moveaxis(jnp.quantile(goals, shares, axis=1), 0, -1)  # [R, d, QUANTILES]
-    capacity, d, _ = positions.shape
-    over_positions = jax.vmap(score, in_axes=(None, None, 0))
-    over_dimensions = jax.vmap(over_positions, in_axes=(None, 0, 0))
-    scores = jax.vmap(over_dimensions, in_axes=(0, None, 0))(jnp.arange(capacity), jnp.arange(d), positions)
-    best = jnp.unravel_index(jnp.argmax(scores), scores.shape)
-    cut = Cut(region=best[0], dimension=best[1], position=positions[best])
-    after, possible = regions.split(state.abstraction, cut, min_width=config.min_width)
-    done = possible & (scores[best] > 0)
-    cut_state = on_split(state, after, parent=cut.region, child=state.abstraction.count)
-    return where(done, cut_state, state), done
 
 
 def _distributions(
@@ -379,7 +307,7 @@ def _known(state: SgimState) -> Bool[Array, "R W"]:
     return jnp.arange(state.competences.shape[1]) < state.written[:, None]
 
 
-def _newest_first(state: SgimState) -> tuple[Int[Array, "R W"], Bool[Array, "R W"]]:
+def newest_first(state: SgimState) -> tuple[Int[Array, "R W"], Bool[Array, "R W"]]:
     """Slots of each region's window from the newest to the oldest, and which of these have been written."""
     window = state.competences.shape[1]
     back = state.written[:, None] - 1 - jnp.arange(window)
@@ -394,6 +322,6 @@ def _halves(state: SgimState) -> tuple[Bool[Array, "R W"], Bool[Array, "R W"]]:
     return age < half, (half <= age) & (age < 2 * half)
 
 
-def _mean(values: Array, mask: Bool[Array, "*n K"]) -> Float[Array, "*n"]:
+def mean_where(values: Array, mask: Bool[Array, "*n K"]) -> Float[Array, "*n"]:
     """Mean over the last axis where `mask`; 0 where there is nothing."""
     return jnp.sum(values * mask, axis=-1) / jnp.maximum(mask.sum(axis=-1), 1)

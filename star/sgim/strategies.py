@@ -7,8 +7,6 @@
              action          so it is, and the Controller imitates the demonstrated actions (mimicry)
              decomposition   along the demonstrated route, region by region and waypoint by waypoint
 
-The competence of an episode is c = 1 - min(1, d_T / d_0), d the distance to the ball of success around the goal.
-
 Source: S. M. Nguyen's habilitation thesis; SGIM-D (Nguyen and Oudeyer 2011), SGIM-ACTS (2012), SGIM-PB (Duminy,
 Nguyen, Duhaut 2021).
 """
@@ -30,8 +28,6 @@ from star.sgim.sections import SgimConfig
 from star.sgim.selection import Choice, SgimState
 from star.sgim.teachers import Demonstrations, nearest
 
-Metrics = dict[str, Array]
-
 
 class Lesson(struct.PyTreeNode):
     """What each environment practises in an epoch, and how it went."""
@@ -51,10 +47,8 @@ class Lesson(struct.PyTreeNode):
     """Of the first episode of the epoch; NaN until it is over."""
 
 
-def init(config: SgimConfig, abstraction: Abstraction) -> SgimState | None:
-    """Nothing practised yet; None if nothing is left to SGIM."""
-    if not config.enabled:
-        return None
+def init(config: SgimConfig, abstraction: Abstraction) -> SgimState:
+    """Nothing practised yet."""
     costs = [1.0] * len(config.strategies) + [teacher.cost for teacher in config.teachers]
     return selection.init(config.selection, abstraction, costs)
 
@@ -98,143 +92,6 @@ def available(config: SgimConfig, state: SgimState, *, key: Array) -> Bool[Array
     return (jax.random.uniform(key, share.shape) < share) & (asked < _budgets(config))
 
 
-def impose(
-    config: SgimConfig, lesson: Lesson, position: Float[Array, "B d"]
-) -> tuple[Lesson, Float[Array, "B d"], Bool[Array, "B"]]:
-    """The lesson with all waypoints passed that are near to `position`, the next one, and whether there is one."""
-    length = lesson.waypoints.shape[1]
-    order = jnp.arange(length)
-    near = jnp.linalg.norm(lesson.waypoints - position[:, None], axis=-1) < config.waypoint_radius
-    met = near & (order >= lesson.leg[:, None])
-    leg = jnp.maximum(lesson.leg, jnp.max(jnp.where(met, order + 1, 0), axis=1))
-    lesson = lesson.replace(leg=leg)
-    return lesson, coming(lesson), leg < length
-
-
-def coming(lesson: Lesson) -> Float[Array, "B d"]:
-    """The next waypoint; the last one where all are passed."""
-    leg = jnp.minimum(lesson.leg, lesson.waypoints.shape[1] - 1)
-    return jnp.take_along_axis(lesson.waypoints, leg[:, None, None], axis=1)[:, 0]
-
-
-def onward(
-    lesson: Lesson,
-    position: Float[Array, "B d"],
-    lower: Float[Array, "B d"],
-    upper: Float[Array, "B d"],
-    *,
-    parts: int = 16,
-) -> tuple[Float[Array, "B d"], Bool[Array, "B"]]:
-    """Where the way from `position` by the waypoints to come first leaves the box, and whether it does.
-
-    It is looked for at `parts` points on each straight leg.
-    """
-    to_come = jnp.arange(lesson.waypoints.shape[1]) >= lesson.leg[:, None]
-    points = _along(position, jnp.where(to_come[..., None], lesson.waypoints, position[:, None]), parts)
-    outside = jnp.any((points < lower[:, None]) | (points >= upper[:, None]), axis=-1)
-    first = jnp.argmax(outside, axis=1)
-    return jnp.take_along_axis(points, first[:, None, None], axis=1)[:, 0], outside.any(axis=1)
-
-
-def babbles(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
-    """Which environments are to follow random subgoals."""
-    if "babbling" not in config.strategies:
-        return jnp.zeros(lesson.taught.shape, bool)
-    return lesson.taught & (lesson.choice.strategy == config.strategies.index("babbling"))
-
-
-def guided(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
-    """Where a teacher chooses the Commander's targets now."""
-    return (lesson.leg < lesson.waypoints.shape[1]) & (lesson.choice.strategy >= len(config.strategies))
-
-
-def ways(
-    config: SgimConfig, lesson: Lesson, start: Float[Array, "B d"], *, most: int = 64, parts: int = 16
-) -> tuple[Float[Array, "N T d"], Float[Array, "N"]]:
-    """The ways that teachers lead from `start`, at most so many, and which of them are some (1, else 0).
-
-    They are given as points, `parts` on each straight leg.
-    """
-    weight, which = jax.lax.top_k(guided(config, lesson).astype(jnp.float32), min(most, len(start)))
-    return _along(start[which], lesson.waypoints[which], parts), weight
-
-
-def begin(lesson: Lesson, distance: Float[Array, "B"], *, radius: float) -> Lesson:
-    """The lesson at the start of its episodes, `distance` m from the goals."""
-    return lesson.replace(away=jnp.maximum(distance - radius, 0.0))
-
-
-def grade(lesson: Lesson, over: Bool[Array, "B"], distance: Float[Array, "B"], *, radius: float) -> Lesson:
-    """Take down the competence of those first episodes that are `over`, `distance` m from their goals."""
-    away = jnp.maximum(distance - radius, 0.0)
-    competence = jnp.where(away > 0, 1 - jnp.minimum(1.0, away / jnp.maximum(lesson.away, 1e-6)), 1.0)
-    return lesson.replace(competence=jnp.where(over & jnp.isnan(lesson.competence), competence, lesson.competence))
-
-
-def learn(config: SgimConfig, state: SgimState, lesson: Lesson) -> tuple[SgimState, Metrics]:
-    """Take in an epoch whose episodes are all graded."""
-    weight = lesson.taught.astype(jnp.float32)
-    taught = jnp.maximum(weight.sum(), 1.0)
-    after = selection.update(config.selection, state, lesson.choice, lesson.competence, weight=weight)
-    metrics = {"competence": jnp.sum(jnp.where(lesson.taught, lesson.competence, 0.0)) / taught}
-    for number, name in enumerate(config.names):
-        metrics[f"share_{name}"] = jnp.sum(weight * (lesson.choice.strategy == number)) / taught
-    for number, teacher in enumerate(config.teachers, len(config.strategies)):
-        metrics[f"queries_{teacher.name}"] = after.episodes[:, number].sum()
-    return after, metrics | {"refused": after.refused}
-
-
-def attraction(config: SgimConfig, state: SgimState) -> Float[Array, "R"] | None:
-    """How the Commander's random targets are drawn: as regions to practise are; None if evenly."""
-    if not config.exploration:
-        return None
-    return selection.probabilities(config.selection, state).sum(axis=-1)
-
-
-def urgency(config: SgimConfig, state: SgimState) -> Float[Array, "R"] | float:
-    """How much there is to find out by examining edges that lead to each region, from 0 to 1.
-
-    Most where it is reached half of the time and no progress is made; a tenth of that where nothing is to be expected.
-    """
-    if not config.refinement:
-        return 1.0
-    mastery = selection.competence(state)
-    standing = 1 - jnp.minimum(jnp.abs(selection.progress(state)), 1.0)
-    return 0.1 + 0.9 * 4 * mastery * (1 - mastery) * standing
-
-
-def mimicking(config: SgimConfig, lesson: Lesson, teacher: int) -> Float[Array, ""]:
-    """Share of the environments that imitate the actions of the teacher with this number."""
-    return jnp.mean(lesson.taught & (lesson.choice.strategy == len(config.strategies) + teacher))
-
-
-class Shown(struct.PyTreeNode):
-    """M demonstrated actions, the states they were done in, those l steps later at most, and the outcomes."""
-
-    state: Float[Array, "M state"]
-    later: Float[Array, "M state"]
-    action: Float[Array, "M act"]
-    outcome: Float[Array, "M d"]
-
-
-def shown(demos: Demonstrations, period: int, *, size: int, key: Array) -> Shown:
-    """`size` steps drawn from the trajectories, each seen as a step towards the end of its segment of `period`."""
-    assert demos.states is not None
-    assert demos.actions is not None
-    assert demos.lengths is not None
-    which_key, when_key = jax.random.split(key)
-    which = jax.random.randint(which_key, (size,), 0, len(demos.outcomes))
-    length = demos.lengths[which]
-    when = jnp.floor(jax.random.uniform(when_key, (size,)) * length).astype(int)
-    end = jnp.minimum((when // period + 1) * period, length)
-    return Shown(
-        state=demos.states[which, when],
-        later=demos.states[which, end],
-        action=demos.actions[which, when],
-        outcome=demos.outcomes[which],
-    )
-
-
 def _prepare(
     config: SgimConfig,
     state: SgimState,
@@ -273,14 +130,6 @@ def _prepare(
         away=jnp.zeros(len(goal)),
         competence=jnp.full(len(goal), jnp.nan, jnp.float32),
     )
-
-
-def _along(start: Float[Array, "N d"], waypoints: Float[Array, "N L d"], parts: int) -> Float[Array, "N P d"]:
-    """Points on the way from `start` by the waypoints, `parts` on each straight leg, both its ends included."""
-    corners = jnp.concatenate([start[:, None], waypoints], axis=1)
-    share = jnp.linspace(0.0, 1.0, parts)[:, None]
-    points = corners[:, :-1, None] + share * (corners[:, 1:] - corners[:, :-1])[:, :, None]
-    return points.reshape(len(start), -1, start.shape[-1])
 
 
 def _within_budget(config: SgimConfig, state: SgimState, choice: Choice, taught: Bool[Array, "B"]) -> Choice:

@@ -11,8 +11,8 @@ from star import loading
 from star.abstraction import forward_model, refinement, regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.reachability import MISSES, REACHES, UNKNOWN, Leaves
-from star.abstraction.refinement import Goals, Graph, Split
-from star.abstraction.regions import Cut
+from star.abstraction.refinement import Goals, Graph
+from star.abstraction.regions import Cut, Split
 from star.learners import replay
 
 R = 6
@@ -77,10 +77,13 @@ NO_GOALS = Goals(lower=jnp.zeros((1, 2)), upper=jnp.zeros((1, 2)), reached=jnp.z
 
 @pytest.fixture(scope="module")
 def refine():
+    """Returns the regions after it, the graph, the splits and the metrics."""
     jitted = jax.jit(refinement.refine)
 
     def call(chosen, abstraction, graph, model, goals=NO_GOALS):
-        return jitted(chosen, abstraction, graph, model, goals, radius=3.0, key=jax.random.key(0))
+        graph, change, metrics = jitted(chosen, abstraction, graph, model, goals, radius=3.0, key=jax.random.key(0))
+        jax.tree.map(np.testing.assert_array_equal, change.before, abstraction)
+        return change.after, graph, change.splits, metrics
 
     return call
 
@@ -436,9 +439,9 @@ def test_random_cuts_come_at_the_same_time_but_anywhere(refine, moving):
     jitted = jax.jit(refinement.refine)
     positions = set()
     for seed in range(8):
-        abstraction, _, splits, metrics = jitted(
+        _, change, metrics = jitted(
             chosen, grid(), knowing((0, 2)), moving((6, 0)), NO_GOALS, radius=3.0, key=jax.random.key(seed)
         )
-        assert int(metrics["mixed"]) == int(metrics["splits"]) == 1 and int(splits.parent[0]) == 0
-        positions.add(tuple(np.asarray(abstraction.lower[4]).tolist()))
+        assert int(metrics["mixed"]) == int(metrics["splits"]) == 1 and int(change.splits.parent[0]) == 0
+        positions.add(tuple(np.asarray(change.after.lower[4]).tolist()))
     assert len(positions) > 3

@@ -153,13 +153,18 @@ def test_a_full_table_refuses_every_cut(split):
 
 def test_each_region_has_its_origin_in_that_of_which_it_was_cut(split):
     before = after = grid(max_regions=9)
-    origin = list(range(9))
-    for parent, where in [(2, cut(2, 1, 3.0)), (4, cut(4, 0, 12.0)), (2, cut(2, 0, 9.0)), (0, cut(0, 0, 0.0))]:
-        origin[int(after.count)] = origin[parent]
+    origin, splits = list(range(9)), []
+    refused = cut(1, 0, 99.0)
+    for where in [cut(2, 1, 3.0), cut(4, 0, 12.0), refused, cut(2, 0, 9.0), cut(0, 0, 0.0)]:
+        child = after.count
         after, done = split(after, where, 1.0)
-        assert bool(done)
-    assert regions.origins(before, after).tolist() == origin == [0, 1, 2, 3, 2, 2, 2, 0, 8]
-    assert regions.origins(before, before).tolist() == list(range(9))
+        splits.append(regions.Split(done, where, child))
+        assert bool(done) == (where is not refused)
+        if done:
+            origin[int(child)] = origin[int(where.region)]
+    change = regions.Change.of(before, after, jax.tree.map(lambda *parts: jnp.stack(parts), *splits))
+    assert change.origin.tolist() == origin == [0, 1, 2, 3, 2, 2, 2, 0, 8]
+    assert change.before is before and change.after is after
 
 
 def test_inherit_copies_along_each_axis():

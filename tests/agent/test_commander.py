@@ -8,10 +8,26 @@ import numpy as np
 import pytest
 
 from star import loading
-from star.agent import commander
-from star.agent.commander import CommanderState, Decision, Model, Successors
+from star.abstraction import regions
+from star.abstraction.forward_model import Outcome
+from star.abstraction.regions import Change
+from star.agent import commander, goal_only, planning, values
+from star.agent.decisions import Decision, Finished, Roadmap, Successors, successors
+from star.agent.values import CommanderState, Model
 
 R, N = 5, 40
+
+
+def known(allowed, believed=None):
+    """A roadmap that says so; where the regions lie is of no account."""
+    return Roadmap(
+        abstraction=None, allowed=allowed, believed=jnp.zeros((R, R), bool) if believed is None else believed
+    )
+
+
+def counted(chosen, state, batch):
+    """`state` with the decisions of `batch` in its model."""
+    return planning.observe(chosen, state, None, batch)
 
 
 def settings(**values):
@@ -64,7 +80,12 @@ def slow_update(q, allowed, batch, *, alpha, discount):
 
 @pytest.fixture(scope="module")
 def observe():
-    return jax.jit(commander.observe)
+    """Takes in decisions, and plans nothing."""
+    return jax.jit(
+        lambda chosen, state, allowed, batch: commander.observe(
+            chosen, state, known(allowed), batch, due=jnp.array(False)
+        )
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -82,7 +103,7 @@ def test_q_learning_averages_the_errors_of_each_cell(observe, seed):
 def test_the_measured_reward_is_that_of_whole_periods_with_the_goal_of_the_task():
     state, allowed = random_state(0)
     batch = random_batch(0)
-    metrics = commander.measure(settings(), state, allowed, batch)
+    metrics = commander.measure(settings(), state, known(allowed), batch)
     np.testing.assert_allclose(
         metrics["reward"], batch.reward[batch.weight > batch.practised + batch.aside].mean(), rtol=1e-5
     )
@@ -145,15 +166,16 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     batch = random_batch(seed)
     believed = rng.random((R, R)) < 0.4
     state = observe(chosen, commander.init(chosen, regions=R), allowed, batch)
-    planned = jax.jit(commander.plan)(chosen, state, allowed, believed=jnp.array(believed))
+    roadmap = known(allowed, jnp.array(believed))
+    planned = jax.jit(planning.plan)(chosen, state, roadmap)
     q, reach, visits = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
     np.testing.assert_allclose(planned.q, q, rtol=1e-5)
     np.testing.assert_allclose(planned.model.reach, reach, rtol=1e-5)
-    settle = partial(jax.jit(commander.settle, static_argnames="periods"), chosen, believed=jnp.array(believed))
+    settle = partial(jax.jit(planning.settle, static_argnames="periods"), chosen)
     q, *_ = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=4, belief=0.1)
     q *= 0.9 + 0.1 * visits / np.maximum(visits.max(axis=-1, keepdims=True), 1.0)
     for before in (state, planned):  # whatever was planned before
-        settled = settle(before, allowed, periods=4)
+        settled = settle(before, roadmap, periods=4)
         np.testing.assert_allclose(settled.q, q, rtol=1e-5, atol=1e-12)
         np.testing.assert_array_equal(settled.model.reach, before.model.reach)
 
@@ -166,10 +188,11 @@ def corridor(batch_of, *, shortcut=False, greedy=False):
     everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
     state = commander.init(chosen, regions=R)
     for batch in batch_of:
-        state = commander.observe(chosen, state, everything, batch)
+        state = counted(chosen, state, batch)
+    roadmap = known(everything, jnp.array(neighbours))
     if greedy:
-        return commander.settle(chosen, state, everything, believed=jnp.array(neighbours), periods=10).q
-    return commander.plan(chosen, state, everything, believed=jnp.array(neighbours)).q
+        return planning.settle(chosen, state, roadmap, periods=10).q
+    return planning.plan(chosen, state, roadmap).q
 
 
 def many(region, target, next_region, *, goal=4, count=100, lost=0.0, reward=0.0):
@@ -214,7 +237,8 @@ def test_values_stay_as_they_are_where_nothing_is_counted_or_nothing_is_best(cha
     chosen = settings(**{"learner": "model", "reward": "success"} | changed)
     state, allowed = random_state(0)
     state = commander.init(chosen, regions=R).replace(q=state.q)
-    settled = commander.settle(chosen, state, allowed, believed=jnp.ones((R, R), bool), periods=3)
+    roadmap = known(allowed, jnp.ones((R, R), bool))
+    settled = commander.settle(chosen, state, roadmap, episode_length=3 * chosen.period)
     np.testing.assert_array_equal(settled.q, state.q)
 
 
@@ -232,10 +256,10 @@ def test_where_the_goals_region_is_cut_nobody_aims_beside_the_goal():
     everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
     state = commander.init(chosen, regions=R)
     for batch in (many(0, 2, 2, goal=2, reward=0.5), many(2, 2, 2, goal=2, reward=1.0)):
-        state = commander.observe(chosen, state, everything, batch)
+        state = counted(chosen, state, batch)
     origin, nothing = jnp.array([0, 1, 2, 2, 4]), many(0, 0, 0, count=0)
-    state = commander.on_refined(chosen, state, state.model, nothing, nothing, origin)
-    settled = commander.settle(chosen, state, everything, believed=jnp.ones((R, R), bool), periods=20)
+    state = state.replace(model=planning.recounted(chosen, state.model, nothing, nothing, origin))
+    settled = planning.settle(chosen, state, known(everything, jnp.ones((R, R), bool)), periods=20)
     for region, goal, wrong in ((0, 3, 2), (2, 3, 2), (0, 2, 3), (3, 2, 3)):
         assert settled.q[region, goal, goal] > settled.q[region, goal, wrong] + 0.6
 
@@ -247,7 +271,7 @@ def test_a_command_that_ends_the_episode_is_worth_less_than_one_that_fails():
 
 def test_a_decision_fades_by_the_memory_each_epoch():
     chosen = settings(learner="model", memory=0.25)
-    state = commander.observe(chosen, commander.init(chosen, regions=R), random_state(0)[1], random_batch(0))
+    state = counted(chosen, commander.init(chosen, regions=R), random_batch(0))
     faded = commander.fade(chosen, state)
     for name in ("led", "rewards", "visits", "lost"):
         np.testing.assert_allclose(getattr(faded.model, name), 0.25 * getattr(state.model, name))
@@ -300,14 +324,14 @@ def slow_successors(mode, reaches, misses, active):
 
 @pytest.mark.parametrize("mode", ["any", "possible", "known"])
 def test_successors_by_mode(mode):
-    got = commander.successors(mode, reaches=jnp.array(REACHES), misses=jnp.array(MISSES), active=jnp.array(ACTIVE))
+    got = successors(mode, reaches=jnp.array(REACHES), misses=jnp.array(MISSES), active=jnp.array(ACTIVE))
     greedy, explore = slow_successors(mode, REACHES, MISSES, ACTIVE)
     np.testing.assert_array_equal(got.greedy, greedy)
     np.testing.assert_array_equal(got.explore, explore)
 
 
 def test_known_falls_back_to_what_is_possible_where_nothing_is_known():
-    got = commander.successors("known", reaches=jnp.array(REACHES), misses=jnp.array(MISSES), active=jnp.array(ACTIVE))
+    got = successors("known", reaches=jnp.array(REACHES), misses=jnp.array(MISSES), active=jnp.array(ACTIVE))
     assert got.greedy[0].tolist() == [False, True, False, False, False]
     assert got.greedy[1].tolist() == [True, True, False, True, False]
     assert got.greedy[3].tolist() == [True, True, True, True, False]
@@ -320,20 +344,20 @@ def test_a_goals_region_may_always_follow_itself():
     state = CommanderState(q=jnp.zeros((R, R, R)).at[..., 0].set(1.0), chosen=jnp.zeros(R))
     many, key = jnp.zeros(300, jnp.int32), jax.random.key(0)
     for there, greedy, random in ((many, {0}, {0, 1}), (many + 2, {1}, {1})):
-        assert set(commander.act(state, allowed, many, there, epsilon=0.0, key=key).tolist()) == greedy
-        assert set(commander.act(state, allowed, many, there, epsilon=1.0, key=key).tolist()) == random
+        assert set(values.choose(state, allowed, many, there, epsilon=0.0, key=key).tolist()) == greedy
+        assert set(values.choose(state, allowed, many, there, epsilon=1.0, key=key).tolist()) == random
     for there, practised, greedy in ((many, many + 3, {1}), (many + 3, many, {0})):  # what is practised is the goal
-        chosen = commander.act(state, allowed, many, there, practised=practised, epsilon=0.0, key=key)
+        chosen = values.choose(state, allowed, many, there, practised=practised, epsilon=0.0, key=key)
         assert set(chosen.tolist()) == greedy
-    values, targets = commander.towards(state, allowed, jnp.int32(0))
-    assert values.tolist() == [1.0, *[0.0] * (R - 1)] and targets.tolist() == [0, *[1] * (R - 1)]
+    worth, targets = values.towards(state, allowed, jnp.int32(0))
+    assert worth.tolist() == [1.0, *[0.0] * (R - 1)] and targets.tolist() == [0, *[1] * (R - 1)]
 
 
 def test_the_greedy_choice_is_the_best_allowed_target_and_ties_break_at_random():
     q = jnp.zeros((R, R, R)).at[0, 1].set(jnp.array([0.0, 3.0, 9.0, 3.0, 1.0]))
     allowed = jnp.ones((R, R), bool).at[:, 2].set(False)
     many = jnp.zeros(500, jnp.int32)
-    targets = commander.act(
+    targets = values.choose(
         CommanderState(q=q, chosen=jnp.zeros(R)),
         Successors(greedy=allowed, explore=allowed),
         many,
@@ -341,8 +365,8 @@ def test_the_greedy_choice_is_the_best_allowed_target_and_ties_break_at_random()
         epsilon=0.0,
         key=jax.random.key(0),
     )
-    values, counts = np.unique(targets, return_counts=True)
-    assert values.tolist() == [1, 3]
+    chosen, counts = np.unique(targets, return_counts=True)
+    assert chosen.tolist() == [1, 3]
     assert counts.min() > 150
 
 
@@ -350,7 +374,7 @@ def test_epsilon_is_the_share_of_random_choices():
     q = jnp.zeros((R, R, R)).at[..., 0].set(1.0)
     allowed = jnp.ones((R, R), bool)
     many = jnp.zeros(4000, jnp.int32)
-    targets = commander.act(
+    targets = values.choose(
         CommanderState(q=q, chosen=jnp.zeros(R)),
         Successors(greedy=allowed, explore=allowed),
         many,
@@ -371,7 +395,7 @@ def test_who_practises_pursues_its_region_by_the_chances_to_reach_it():
     )
     zeros = jnp.zeros(2, jnp.int32)
     practised = jnp.array([-1, 3])
-    targets = commander.act(
+    targets = values.choose(
         state, everything, zeros, zeros + 1, practised=practised, epsilon=0.0, key=jax.random.key(0)
     )
     assert targets.tolist() == [2, 4]
@@ -454,10 +478,20 @@ def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
     led, lost = np.stack(led), np.stack([visits[0], rewards[0]])
     led[:, :, :, 3:] = led[:, 3:] = led[:, :, 3:] = 0  # nothing there
     earlier = Model(led=led, rewards=rewards, visits=visits, lost=lost, reach=reach)
-    state = CommanderState(q=jnp.array(q), chosen=jnp.arange(1.0, R + 1), model=earlier.replace(reach=reach + 1))
-    after = jax.jit(commander.on_refined)(chosen, state, earlier, batch, cells, jnp.array(ORIGIN))
+    model = jax.jit(planning.recounted)(chosen, earlier, batch, cells, jnp.array(ORIGIN))
     for name, table in slow_recount(batch, cells, earlier, prior=2.0).items():
-        np.testing.assert_allclose(getattr(after.model, name), table, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(getattr(model, name), table, rtol=1e-5, atol=1e-6)
+
+    boxes = regions.create(((0.0, 0.0), (5.0, 1.0)), ((1.0, 2.0, 3.0, 4.0), ()), max_regions=R)
+    centre = lambda region: (boxes.lower + boxes.upper)[region] / 2  # noqa: E731
+    decisions = batch.replace(goal=centre(cells.goal_region))
+    where = centre(cells.region), centre(cells.next_region)
+    finished = Finished(decisions, Outcome(where[0], where[0], where[0], where[1], batch.weight))
+    state = CommanderState(q=jnp.array(q), chosen=jnp.arange(1.0, R + 1), model=earlier.replace(reach=reach + 1))
+    change = Change(before=boxes, after=boxes, splits=None, origin=jnp.array(ORIGIN))
+    began = state.replace(model=earlier)
+    after = jax.jit(commander.follow)(chosen, state, change, began, finished)
+    jax.tree.map(np.testing.assert_array_equal, after.model.replace(reach=0), model.replace(reach=0))
     cube = np.ix_(ORIGIN, ORIGIN, ORIGIN)
     np.testing.assert_array_equal(after.q, q[cube])
     np.testing.assert_array_equal(after.model.reach, (reach + 1)[cube])
@@ -467,33 +501,34 @@ def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
 def test_without_cuts_counting_anew_changes_nothing():
     chosen, batch = settings(learner="model"), random_batch(0)
     before = commander.init(chosen, regions=R)
-    state = commander.observe(chosen, before, random_state(0)[1], batch)
-    again = commander.on_refined(chosen, state, before.model, batch, batch, jnp.arange(R))
-    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), again, state)
+    model = counted(chosen, before, batch).model
+    again = planning.recounted(chosen, before.model, batch, batch, jnp.arange(R))
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), again, model)
 
 
 def test_who_began_beyond_the_cut_tells_nothing_of_this_side():
     """A wall cuts region 1 in two: from part 3 region 2 is reached, from part 1 it is not, whatever was known."""
     chosen = settings(learner="model", prior=1.0)
-    everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
-    began = commander.observe(chosen, commander.init(chosen, regions=R), everything, many(1, 2, 2, count=1000))
+    began = counted(chosen, commander.init(chosen, regions=R), many(1, 2, 2, count=1000))
     join = partial(jax.tree.map, lambda *parts: np.concatenate(parts))
     batch = join(many(1, 2, 1), many(1, 2, 2))
     cells = join(many(1, 2, 1), many(3, 2, 2))
-    state = commander.observe(chosen, began, everything, batch)
-    after = commander.on_refined(chosen, state, began.model, batch, cells, jnp.array(ORIGIN))
-    led = np.asarray(after.model.led)[0, :, 2]
+    after = planning.recounted(chosen, began.model, batch, cells, jnp.array(ORIGIN))
+    led = np.asarray(after.led)[0, :, 2]
     assert led[1, 2] / led[1].sum() < 0.02 and led[3, 2] / led[3].sum() > 0.98
 
 
-def test_nobody_practises_without_a_commander():
-    assert commander.practice(settings(practice=0.3)) == 0.3
-    assert commander.practice(settings(practice=0.3, enabled=False)) == 0.0
+def test_nobody_practises_without_a_commander_or_in_greedy_episodes():
+    here, chosen, key = jnp.zeros((400, 2)), settings(practice=0.3), jax.random.key(0)
+    practising = lambda memory: float((memory.practice >= 0).mean())  # noqa: E731
+    assert practising(commander.begin(chosen, here, decisions=None, key=key)) == pytest.approx(0.3, abs=0.07)
+    assert practising(commander.begin(chosen, here, decisions=5, key=key)) == 0
+    assert practising(goal_only.begin(chosen, here, decisions=None, key=key)) == 0
 
 
 def test_the_value_towards_a_goal_is_that_of_the_best_allowed_target():
     state, allowed = random_state(3)
-    value, target = map(np.asarray, commander.towards(state, allowed, jnp.asarray(2)))
+    value, target = map(np.asarray, values.towards(state, allowed, jnp.asarray(2)))
     q, greedy = np.asarray(state.q), np.asarray(allowed.greedy)
     for region in range(R):
         best = max((j for j in range(R) if greedy[region, j]), key=lambda j: q[region, 2, j])

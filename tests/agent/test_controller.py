@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 import envs
 from star import loading
-from star.agent import controller, state
+from star.agent import checks, controller
+from star.agent.subgoals import Boxes, Points
+from star.agent.task import Task
 from star.spec import Spec
 
 
@@ -38,9 +40,13 @@ def knowledge(*, abstract=(0, 1), heading=None, state_dim=12):
     )
 
 
+def task_of(spec, *, tutored=True):
+    return Task.of(loading.parse({"tutor": {"enabled": tutored}}), spec)
+
+
 def test_it_sees_the_state_without_position_then_the_subgoal():
     state, subgoal = jnp.arange(12.0).reshape(2, 6), jnp.array([[90.0, 91.0], [92.0, 93.0]])
-    seen = controller.observe(settings(frame="world"), knowledge(abstract=(0, 2)), state, subgoal)
+    seen = controller.observe(settings(frame="world"), task_of(knowledge(abstract=(0, 2))), state, subgoal)
     np.testing.assert_array_equal(seen, [[1, 3, 4, 5, 90, 91], [7, 9, 10, 11, 92, 93]])
 
 
@@ -69,7 +75,7 @@ def test_in_the_bodys_axes_the_world_may_be_turned_about_it(angle, seed, sign, l
     other[7:9], way[:2] = turned(angle, state[7:9]), turned(angle, subgoal[:2])
     if spec.heading:
         way[-2:] = turned(angle, subgoal[-2:])
-    see = partial(controller.observe, settings(frame="body"), spec)
+    see = partial(controller.observe, settings(frame="body"), task_of(spec))
     seen = see(jnp.asarray(state), jnp.asarray(subgoal))
     np.testing.assert_allclose(seen, see(jnp.asarray(other), jnp.asarray(way)), atol=1e-4)
 
@@ -78,7 +84,7 @@ def test_in_the_bodys_axes_what_is_ahead_comes_first_and_boxes_are_their_nearest
     half = np.sqrt(0.5)
     state = jnp.array([0.0, 0, 0.5, half, 0, 0, half, 0.0, 2.0, 0.3, 7.0, 8.0])  # faces +y, moves along it at 2 m/s
     box = jnp.array([-3.0, 1.0, 1.0, 5.0])
-    seen = controller.observe(settings(frame="body"), knowledge(), state, box)
+    seen = controller.observe(settings(frame="body"), task_of(knowledge(), tutored=False), state, box)
     np.testing.assert_allclose(seen, [0.5, 1, 0, 0, 0, 2, 0, 0.3, 7, 8, 1, 0, 3, 1], atol=1e-6)
 
 
@@ -87,7 +93,7 @@ def test_the_subgoal_stays_where_it_is_in_the_world():
     path = rng.normal(size=(20, 2)).astype(np.float32)
     first = subgoal = jnp.array([3.0, -2.0])
     for here, there in zip(path[:-1], path[1:], strict=True):
-        subgoal = controller.next_subgoal(subgoal, here, there)
+        subgoal = Points(2).moved(subgoal, here, there)
         np.testing.assert_allclose(there + subgoal, path[0] + first, atol=1e-5)
 
 
@@ -95,7 +101,7 @@ def test_the_subgoal_stays_where_it_is_in_the_world():
 def test_the_reward_follows_its_equation(reward):
     rng = np.random.default_rng(1)
     before, after = rng.normal(size=(2, 30, 2)).astype(np.float32)
-    got = controller.reward(settings(reward=reward, reward_scale=0.5), before, after, size=2)
+    got = controller.reward(settings(reward=reward, reward_scale=0.5), task_of(knowledge()), before, after)
     for n in range(30):
         left = np.sqrt((after[n] ** 2).sum())
         expected = -left if reward == "distance" else np.sqrt((before[n] ** 2).sum()) - left
@@ -104,19 +110,21 @@ def test_the_reward_follows_its_equation(reward):
 
 def test_a_box_in_place_of_a_subgoal_moves_whole_and_is_as_far_as_its_nearest_point():
     box = jnp.array([[1.0, -1.0, 3.0, 2.0], [-1.0, -1.0, 1.0, 1.0], [-9.0, 4.0, -3.0, 5.0]])  # lower, then upper
-    np.testing.assert_allclose(controller.distance(box, size=2), [1.0, 0.0, 5.0])
-    moved = controller.next_subgoal(box, jnp.zeros((3, 2)), jnp.array([[1.0, 2.0]] * 3))
+    boxes = Boxes(4, margin=1.0)
+    np.testing.assert_allclose(boxes.distance(box), [1.0, 0.0, 5.0])
+    moved = boxes.moved(box, jnp.zeros((3, 2)), jnp.array([[1.0, 2.0]] * 3))
     np.testing.assert_allclose(moved, box - np.array([1, 2, 1, 2]))
-    got = controller.reward(settings(reward="progress", reward_scale=1.0), box, moved, size=2)
+    paid = settings(reward="progress", reward_scale=1.0)
+    got = controller.reward(paid, task_of(knowledge(), tutored=False), box, moved)
     np.testing.assert_allclose(got, [1.0, -1.0, 5.0 - np.hypot(4, 2)], rtol=1e-6)
 
 
 def test_a_body_that_faces_nowhere_has_no_axes_of_its_own():
     point = Spec.of(envs.make("point_maze"))
     with pytest.raises(ValueError, match="controller.frame: body, but the body has no orientation; allowed: world"):
-        state.check(loading.parse({"controller": {"frame": "body"}}), point)
+        checks.check(loading.parse({"controller": {"frame": "body"}}), point)
     with pytest.raises(ValueError, match="controller.tilt_penalty: 2, but the body has no orientation; allowed: 0"):
-        state.check(loading.parse({"controller": {"tilt_penalty": 2.0}}), point)
+        checks.check(loading.parse({"controller": {"tilt_penalty": 2.0}}), point)
 
 
 def test_tilt_costs_by_the_cosine_between_the_bodys_up_axis_and_the_worlds():

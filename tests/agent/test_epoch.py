@@ -10,11 +10,12 @@ import pytest
 from star import loading
 from star.abstraction import refinement
 from star.abstraction.forward_model import Outcome
-from star.agent import epoch as hierarchy
-from star.agent import state as states
-from star.agent.commander import Decision
+from star.agent import checks, commander, controller, epoch, levels
+from star.agent.decisions import Decision, Finished
+from star.agent.task import Task
 from star.learners import replay
 from star.learners.replay import Transition
+from star.sgim.lessons import Marks
 from star.spec import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and trainer.num_envs of the tiny hierarchy
@@ -30,7 +31,7 @@ def ended(recording, i, b):
 
 def finished(recording, i, b):
     """Whether segment i completes k uninterrupted env steps under one target."""
-    return recording.before.clock[i, b] == K - L and not ended(recording, i, b)
+    return recording.before.memory.clock[i, b] == K - L and not ended(recording, i, b)
 
 
 def test_only_periods_of_exactly_k_steps_teach_commander_and_forward_model(recording):
@@ -54,22 +55,23 @@ def test_a_period_is_lost_where_the_task_was_terminated_and_not_where_it_was_tru
 def test_a_period_lost_in_the_last_step_of_an_episode_is_not_counted_as_finished_too(recording):
     # time is up there, so `ended`, which is for ends before it, is 0 though the task terminated
     fatal = (recording.steps.terminated * recording.steps.alive)[:, -1].any(axis=1)
-    lost = 0
+    config, lost = recording.config.agent(), 0
+    task, roadmap = Task.of(config, recording.spec), SimpleNamespace(abstraction=recording.abstraction)
     for i in np.flatnonzero(fatal):
-        advanced, steps = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (recording.advanced, recording.steps))
-        steps = steps.replace(ended=np.zeros_like(steps.ended))
-        state = SimpleNamespace(abstraction=recording.abstraction)
-        decision, outcome = hierarchy.finished_period(recording.config.agent(), recording.spec, state, advanced, steps)
-        last = steps.terminated[-1] * steps.alive[-1] > 0
-        assert (decision.lost[last] == 1).all() and not decision.weight[last].any() and not outcome.weight[last].any()
-        lost += (last & (advanced.clock == 0)).sum()
+        memory, passed = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (recording.commanded, recording.passed))
+        passed = passed.replace(ended=np.zeros_like(passed.ended))
+        memory, finished = commander.experience(config.commander, task, roadmap, memory, passed, Marks())
+        last = passed.terminated[-1] * passed.alive[-1] > 0
+        assert (finished.decision.lost[last] == 1).all()
+        assert not finished.decision.weight[last].any() and not finished.outcome.weight[last].any()
+        lost += (last & (memory.clock == 0)).sum()
     assert lost > 0
 
 
 def test_a_finished_period_tells_where_it_began_what_it_aimed_at_and_where_it_ended(recording):
     began = {}
     for i, b in segments(recording):
-        if recording.before.clock[i, b] == 0:
+        if recording.before.memory.clock[i, b] == 0:
             began[b] = i
         if not finished(recording, i, b):
             continue
@@ -79,7 +81,7 @@ def test_a_finished_period_tells_where_it_began_what_it_aimed_at_and_where_it_en
         assert decision.goal_region[i, b] == recording.commanded.goal_region[first, b]
         assert decision.target[i, b] == recording.commanded.target[first, b]
         assert decision.practised[i, b] == (recording.commanded.practice[first, b] >= 0)
-        steps = np.concatenate([recording.steps.reward[first, :, b], recording.steps.reward[i, :, b]])
+        steps = -np.concatenate([recording.steps.distance[first, :, b], recording.steps.distance[i, :, b]])
         expected = steps.max() if recording.published else steps.mean()
         np.testing.assert_allclose(decision.reward[i, b], expected, rtol=1e-5)
         end = recording.steps.next_obs[i, -1, b, :2]
@@ -147,7 +149,7 @@ def test_the_tutors_chain_is_cut_where_the_target_or_the_episode_ends(recording)
     for i, b in segments(recording):
         terminated = (recording.steps.terminated[i, :, b] * recording.steps.alive[i, :, b]).any()
         assert recording.tutor.terminated[i, b] == terminated
-        assert recording.tutor.cut[i, b] == (recording.before.clock[i, b] == K - L or ended(recording, i, b))
+        assert recording.tutor.cut[i, b] == (recording.before.memory.clock[i, b] == K - L or ended(recording, i, b))
     assert (recording.tutor.weight == 1).all()
 
 
@@ -161,22 +163,22 @@ class Epoch:
 
         def once(agent, state):
             self.traces += 1
-            return hierarchy.epoch(agent, self.spec, env, state)
+            return epoch.epoch(agent, self.spec, env, state)
 
         self.one = jax.jit(once)
-        self.init = jax.jit(lambda key: states.init(self.config.agent(), self.spec, key=key))
+        self.init = jax.jit(lambda key: levels.init(self.config.agent(), self.spec, key=key))
 
 
 @pytest.fixture(scope="module")
-def epoch(breaking_env, tiny):
+def jitted(breaking_env, tiny):
     return Epoch(breaking_env, tiny)
 
 
 @pytest.fixture(scope="module")
-def first(epoch):
+def first(jitted):
     """Start and end of a first epoch."""
-    start = epoch.init(jax.random.key(0))
-    return start, *epoch.one(epoch.config.agent(), start)
+    start = jitted.init(jax.random.key(0))
+    return start, *jitted.one(jitted.config.agent(), start)
 
 
 def stack(*trees):
@@ -207,8 +209,8 @@ def test_an_epoch_changes_every_level_and_nothing_about_shapes_types_or_structur
 
 def test_metrics_are_finite_scalars_prefixed_by_level(first):
     _, _, metrics = first
-    levels = {"commander", "tutor", "controller", "forward_model", "refinement", "abstraction", "train", "env", "graph"}
-    assert {name.split("/")[0] for name in metrics} == levels
+    parts = {"commander", "tutor", "controller", "forward_model", "refinement", "abstraction", "train", "env"}
+    assert {name.split("/")[0] for name in metrics} == parts
     for name, value in metrics.items():
         assert value.shape == () and np.isfinite(value), name
 
@@ -220,7 +222,7 @@ def test_early_ends_are_counted_by_their_reason(first):
         count = float(metrics[name])
         assert count == round(count) and 0 < count <= B * 30 // L
     assert float(metrics["env/overflow"]) == 0
-    assert not any(metrics[name] for name in metrics if name.endswith("non_finite") and name != "env/non_finite")
+    assert float(metrics["env/obs_non_finite"]) == 0
 
 
 def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(first):
@@ -231,16 +233,17 @@ def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(fi
     assert np.isfinite(items.start[complete]).all() and np.isfinite(items.end[complete]).all()
 
 
-def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neither(epoch, first, tiny):
+def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neither(jitted, first, tiny):
     _, state, _ = first
-    state, _ = epoch.one(epoch.config.agent(), state)
+    state, _ = jitted.one(jitted.config.agent(), state)
     other = loading.parse(tiny, {"commander.discount": 0.5, "tutor.reward_scale": 0.3})
-    epoch.one(other.agent(), state)
-    assert epoch.traces == 1
+    jitted.one(other.agent(), state)
+    assert jitted.traces == 1
 
 
-def test_after_a_split_the_commander_counts_by_the_new_regions(epoch):
-    state = epoch.init(jax.random.key(0))
+def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
+    config, spec = jitted.config.agent(), jitted.spec
+    state = jitted.init(jax.random.key(0))
     before = state.abstraction
     capacity = before.capacity
     count = int(state.abstraction.count)
@@ -266,26 +269,37 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(epoch):
     )
     nowhere = jnp.zeros((1, 2))
     goals = refinement.Goals(lower=nowhere, upper=nowhere, reached=jnp.zeros(1, bool), weight=jnp.zeros(1))
-    after, metrics = jax.jit(hierarchy.refine, static_argnums=1)(
-        epoch.config.agent(), epoch.spec, state, goals, key=jax.random.key(0)
-    )
+
+    @jax.jit
+    def refined(state):
+        return refinement.refine(
+            config,
+            state.abstraction,
+            state.graph,
+            state.forward_model,
+            goals,
+            radius=spec.success_radius,
+            key=jax.random.key(0),
+        )
+
+    _, change, metrics = refined(state)
     assert int(metrics["splits"]) == 1
-    assert int(after.abstraction.count) == count + 1
+    assert int(change.after.count) == count + 1
     expected = np.array(q)
     expected[count] = expected[0]
     expected[:, count] = expected[:, 0]
     expected[:, :, count] = expected[:, :, 0]
     # Without the overlap, in which nobody can be located: one decision from each part to the other.
-    mended = lambda table: table.replace(upper=table.upper.at[target].set(before.upper[target]))  # noqa: E731
-    after = after.replace(abstraction=mended(after.abstraction))
-    boxes = after.abstraction
-    start, end, goal = (boxes.lower[jnp.array(where)] + 0.01 for where in ([0, count], [count, 0], [target, count]))
+    mended = change.after.replace(upper=change.after.upper.at[target].set(before.upper[target]))
+    change = change.replace(after=mended)
+    start, end, goal = (mended.lower[jnp.array(where)] + 0.01 for where in ([0, count], [count, 0], [target, count]))
     ones, region = jnp.ones(2), jnp.zeros(2, jnp.int32)
     decision = Decision(
         region, jnp.array([target, 0]), jnp.array([target, 0]), ones, region, ones, *[0 * ones] * 3, goal=goal
     )
     outcome = Outcome(start=start, lower=start, upper=start, end=end, weight=ones)
-    learnt = hierarchy._command_in_parts(epoch.config.agent(), after, before, state.commander.model, decision, outcome)
+    known = state.commander
+    learnt = commander.follow(config.commander, known, change, known, Finished(decision, outcome))
     np.testing.assert_array_equal(learnt.q, expected)
     assert float(learnt.chosen[0]) == float(learnt.chosen[count]) == 0.5
     led = np.argwhere(np.asarray(learnt.model.led))
@@ -299,7 +313,7 @@ def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tin
     if "." in section:
         overrides[f"{section.split('.')[0]}.learner"] = "td3"
     with pytest.raises(ValueError) as caught:
-        states.check(loading.parse(tiny, overrides), Spec.of(breaking_env.env))
+        checks.check(loading.parse(tiny, overrides), Spec.of(breaking_env.env))
     assert section in str(caught.value) and "batch_size" in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -346,7 +360,7 @@ def test_hindsight_makes_what_was_reached_the_subgoal_of_half_of_the_batch(break
         weight=jnp.ones(n),
         extras=jnp.asarray(reached),
     )
-    got = hierarchy._in_hindsight(agent, spec, batch, jax.random.key(0))
+    got = controller._in_hindsight(agent.controller, Task.of(agent, spec), batch, jax.random.key(0))
     changed = np.asarray(got.obs)[:, -1] != 7.0
     assert 0.4 < changed.mean() < 0.6
     np.testing.assert_array_equal(got.obs[:, :2], batch.obs[:, :2])
@@ -362,23 +376,24 @@ def test_hindsight_makes_what_was_reached_the_subgoal_of_half_of_the_batch(break
 
 
 def test_a_termination_costs_its_penalty(recording):
-    steps = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.steps)
+    passed = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.passed)
+    config = recording.config.agent()
     paid, less = (
-        hierarchy._controller_rollout(
-            loading.parse(recording.config.model_dump(), {"controller.termination_penalty": price}).agent(),
-            recording.spec,
-            steps,
+        controller.experience(
+            config.controller.model_copy(update={"termination_penalty": price}),
+            Task.of(config, recording.spec),
+            passed,
             env_steps=0.0,
         ).reward
         for price in (0.0, 3.0)
     )
-    np.testing.assert_allclose(paid - less, 3.0 * steps.terminated, atol=1e-5)
-    assert steps.terminated.any()
+    np.testing.assert_allclose(paid - less, 3.0 * passed.terminated, atol=1e-5)
+    assert passed.terminated.any()
 
 
 def test_an_epoch_charges_for_tilts_by_the_env_steps_before_it(breaking_env, turning, tiny):
-    epoch = turning.episode_length * B  # env steps
-    rising = {"tilt_penalty": 100.0, "tilt_start": 0.01, "tilt_steps": 2 * epoch}
+    env_steps = turning.episode_length * B  # in an epoch
+    rising = {"tilt_penalty": 100.0, "tilt_start": 0.01, "tilt_steps": 2 * env_steps}
     values = loading.parse(tiny, {"commander.enabled": False, "controller": tiny["controller"] | rising})
     agent = Epoch(breaking_env, values.model_dump(mode="json"), turning)
     start = agent.init(jax.random.key(0))
@@ -392,8 +407,8 @@ def test_an_epoch_charges_for_tilts_by_the_env_steps_before_it(breaking_env, tur
 
 
 def test_what_is_reached_later_in_the_segment_is_seen_from_every_step(recording):
-    steps = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.steps)
-    later = np.asarray(hierarchy._later(recording.spec, steps))
+    passed = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.passed)
+    later = np.asarray(controller._later(Task.of(recording.config, recording.spec), passed))
     end = recording.steps.next_obs[0, -1, :, :2]
     for t in range(L):
         np.testing.assert_allclose(later[t, :, 0], end - recording.steps.obs[0, t, :, :2], atol=1e-5)

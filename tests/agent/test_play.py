@@ -11,8 +11,11 @@ from scipy.spatial.transform import Rotation
 import envs
 from star import loading
 from star.abstraction import regions
-from star.agent import play as episode
-from star.agent import state as states
+from star.agent import commander, levels, play
+from star.agent.decisions import Roadmap, Scene, target_box
+from star.agent.segments import Choice
+from star.agent.task import Task
+from star.sgim.lessons import Marks
 from star.spec import Spec
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and the environments of the recording
@@ -51,16 +54,16 @@ def test_the_recording_shows_everything_that_the_tests_below_are_about(recording
 def test_the_clock_counts_env_steps_modulo_k_and_restarts_with_the_episode(recording):
     clock = np.zeros(B, int)
     for i in range(len(recording.subgoal)):
-        np.testing.assert_array_equal(recording.before.clock[i], clock)
+        np.testing.assert_array_equal(recording.before.memory.clock[i], clock)
         clock = (clock + L) % K
         for b in range(B):
             if ended(recording, i, b):
                 clock[b] = 0
-    np.testing.assert_array_equal(recording.last.clock, clock)
+    np.testing.assert_array_equal(recording.last.memory.clock, clock)
 
 
 def test_target_and_box_change_only_where_the_clock_is_0(recording):
-    before, after = recording.before, recording.commanded
+    before, after = recording.before.memory, recording.commanded
     going_on = before.clock != 0
     assert going_on.any()
     for old, new in (
@@ -76,7 +79,7 @@ def test_target_and_box_change_only_where_the_clock_is_0(recording):
 
 def test_a_decision_starts_from_the_regions_of_state_and_goal(recording):
     for i, b in streams_and_segments(recording):
-        if recording.before.clock[i, b] == 0:
+        if recording.before.memory.clock[i, b] == 0:
             obs = recording.before.env.obs[i, b]
             assert recording.commanded.region[i, b] == slow_locate(recording.abstraction, obs[:2])
             assert recording.commanded.goal_region[i, b] == slow_locate(recording.abstraction, obs[4:6])
@@ -97,9 +100,9 @@ def test_the_box_is_the_region_or_the_surroundings_of_the_goal_in_its_own_region
 def test_a_region_is_practised_until_it_is_reached_and_by_the_same_environments(recording):
     redrawn = 0
     for i, b in streams_and_segments(recording):
-        before, after = recording.before.practice[i, b], recording.commanded.practice[i, b]
+        before, after = recording.before.memory.practice[i, b], recording.commanded.practice[i, b]
         assert (before < 0) == (after < 0) and after < recording.abstraction.count
-        reached = before == recording.commanded.region[i, b] and recording.before.clock[i, b] == 0
+        reached = before == recording.commanded.region[i, b] and recording.before.memory.clock[i, b] == 0
         drawn_before = before < recording.abstraction.count
         assert after == before or reached or not drawn_before
         redrawn += reached and after != before
@@ -132,17 +135,17 @@ def test_the_tutor_decides_once_in_l_steps_from_what_the_environment_shows(recor
 def test_the_commander_is_paid_the_max_or_the_mean_of_the_external_reward_over_its_k_steps(recording):
     total = [[] for _ in range(B)]
     for i, b in streams_and_segments(recording):
-        if recording.before.clock[i, b] == 0:
+        if recording.before.memory.clock[i, b] == 0:
             total[b] = []
-        total[b] += [recording.steps.reward[i, t, b] for t in range(L) if recording.steps.alive[i, t, b]]
+        total[b] += [-recording.steps.distance[i, t, b] for t in range(L) if recording.steps.alive[i, t, b]]
         expected = max(total[b]) if recording.published else sum(total[b]) / K
-        np.testing.assert_allclose(recording.rolled.reward[i, b], expected, rtol=1e-5)
+        np.testing.assert_allclose(recording.advanced.memory.reward[i, b], expected, rtol=1e-5)
 
 
-def test_the_external_reward_is_minus_the_distance_to_the_goal(recording):
+def test_the_distance_is_that_to_the_goal(recording):
     next_obs = recording.steps.next_obs
     distance = np.linalg.norm(next_obs[..., :2] - next_obs[..., 4:6], axis=-1)
-    np.testing.assert_allclose(recording.steps.reward, -distance, rtol=1e-5)
+    np.testing.assert_allclose(recording.steps.distance, distance, rtol=1e-5)
 
 
 def test_an_environment_that_ended_waits_for_the_end_of_the_segment(recording):
@@ -214,7 +217,8 @@ def test_dimensions_that_the_goal_leaves_open_keep_the_bounds_of_the_region(tiny
     np.testing.assert_array_equal(spec.abstract(obs), [[1, 2, 5]])
     made = regions.create(spec.space, spec.region_cuts, max_regions=2)
     region = jnp.array([1])
-    box = episode.target_box(loading.parse(tiny).agent(), spec, made, region, jnp.array([True]), point)
+    task = Task.of(loading.parse(tiny), spec)
+    box = target_box(task, made, region, around=jnp.array([True]), point=point)
     np.testing.assert_array_equal(box.lower, [[5, 6, 4]])
     np.testing.assert_array_equal(box.upper, [[7, 8, 8]])
 
@@ -239,17 +243,23 @@ def test_subgoals_with_a_heading_stay_where_they_are_while_the_agent_moves_and_t
     agent = loading.parse(tiny).agent()
 
     def rolled(key):
-        state = states.init(agent, spec, key=key)
-        streams = episode.start(spec, breaking_env, key=key)
-        subgoal = jax.random.normal(key, (B, 4))
-        return episode.rollout(agent, spec, breaking_env, state, streams, subgoal, deterministic=False, key=key)[1]
+        state = levels.init(agent, spec, key=key)
+        playing = levels.of(agent, spec)
+        streams = play.start(playing, breaking_env, key=key)
+        choice = Choice(subgoal=jax.random.normal(key, (B, 4)))
+        return play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)[1]
 
-    steps = jax.tree.map(np.asarray, jax.jit(rolled)(jax.random.key(0)))
-    pose = np.asarray(spec.pose(steps.obs))
-    going = steps.alive.min(axis=0) > 0
-    wanted = (pose + steps.subgoal)[:, going]
+    passed = jax.tree.map(np.asarray, jax.jit(rolled)(jax.random.key(0)))
+    pose = np.asarray(spec.pose(passed.obs))[:-1]
+    going = passed.alive.min(axis=0) > 0
+    wanted = (pose + passed.subgoal[:-1])[:, going]
     assert going.any() and (np.ptp(pose[:, going], axis=0) > 1e-3).all()
     np.testing.assert_allclose(wanted, np.broadcast_to(wanted[0], wanted.shape), atol=1e-3)
+
+
+def scene_of(spec, env_state):
+    """What the Commander sees."""
+    return Scene(spec.abstract(env_state.obs), spec.goal_point(env_state.obs), env_state.metrics["success"])
 
 
 @pytest.mark.parametrize("hold", [True, False, "region"])
@@ -258,17 +268,20 @@ def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_e
     spec = Spec.of(breaking_env.env)
 
     def commanded(key):
-        state = states.init(agent, spec, key=key)
+        state = levels.init(agent, spec, key=key)
+        playing = levels.of(agent, spec, greedy=True)
         away = jnp.zeros_like(state.commander.q).at[..., 2].set(1.0)  # everybody is sent to region 2
-        state = state.replace(commander=state.commander.replace(q=away))
-        streams = episode.start(spec, breaking_env, key=key)
+        known = state.commander.replace(q=away)
+        streams = play.start(playing, breaking_env, decisions=1, key=key)
         success = (jnp.arange(B) < 4).astype(jnp.float32)
-        here = jnp.where((jnp.arange(B) < 2)[:, None], spec.abstract(streams.env.obs), spec.goal_point(streams.env.obs))
-        obs = streams.env.obs.at[:, spec.state_dim :].set(here)  # the first two are in the region of their goal
-        arrived = streams.env.replace(obs=obs, metrics=streams.env.metrics | {"success": success})
-        streams = streams.replace(env=arrived, practice=jnp.where(jnp.arange(B) % 4 == 3, 2, -1))
-        allowed = episode.successors(agent, state)
-        return episode.command(agent, spec, state, allowed, streams, epsilon=0.0, key=key)
+        seen = scene_of(spec, streams.env)
+        goal = jnp.where((jnp.arange(B) < 2)[:, None], seen.position, seen.goal)
+        seen = seen._replace(goal=goal, success=success)  # the first two are in the region of their goal
+        memory = streams.memory.replace(practice=jnp.where(jnp.arange(B) % 4 == 3, 2, -1))
+        roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
+        return commander.command(
+            agent.commander, playing.task, known, roadmap, memory, seen, Marks(), env_steps=None, key=key
+        )
 
     got = jax.jit(commanded)(jax.random.key(3))
     at_goal = np.asarray(got.target == got.goal_region)
@@ -286,11 +299,11 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
     spec = replace(Spec.of(breaking_env.env), episode_length=7 * L)
 
     def played(key):
-        state = states.init(agent, spec, key=key)
+        state = levels.init(agent, spec, key=key)
         stay = jnp.broadcast_to(jnp.eye(state.abstraction.capacity)[:, None], state.commander.q.shape)
-        monkeypatch.setattr(episode, "settled", lambda *_, **__: state.commander.replace(q=stay))
+        monkeypatch.setattr(commander, "settle", lambda *_, **__: state.commander.replace(q=stay))
         look = lambda env_state, subgoal, box, action: (spec.abstract(env_state.obs), box)  # noqa: E731
-        return state.abstraction, *episode.play(agent, spec, breaking_env, state, record=look, key=key)
+        return state.abstraction, *play.greedy(agent, spec, breaking_env, state, record=look, key=key)
 
     abstraction, streams, (path, box) = jax.device_get(jax.jit(played)(jax.random.key(4)))
     path = np.concatenate([path[::L], spec.abstract(streams.env.obs)[None]])  # where each segment begins, and the end
@@ -305,14 +318,17 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
             aimed = [j for j in range(abstraction.count) if (abstraction.lower[j] == lower[i, b]).all()]
             if arrival and clock and aimed == [slow_locate(abstraction, path[i + 1, b])] != [goal]:
                 clock, early = 0, early + 1
-        assert streams.clock[b] == clock
+        assert streams.memory.clock[b] == clock
     assert (0 < early < 7 * B) == arrival
 
 
 def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
     agent = loading.parse(tiny).agent()
-    state = states.init(agent, Spec.of(breaking_env.env), key=jax.random.key(0))
-    short, one = (episode.settled(agent, state, episode_length=steps).q for steps in (K - L, K))
+    state = levels.init(agent, Spec.of(breaking_env.env), key=jax.random.key(0))
+    roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
+    short, one = (
+        commander.settle(agent.commander, state.commander, roadmap, episode_length=steps).q for steps in (K - L, K)
+    )
     assert np.asarray(one).any()
     np.testing.assert_array_equal(short, one)
 
@@ -321,28 +337,32 @@ def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
 def test_who_comes_back_to_a_region_makes_less_of_what_it_was_told_there(breaking_env, tiny, retry):
     agent = loading.parse(tiny, {"commander.retry": retry, "commander.hold": False}).agent()
     spec = replace(Spec.of(breaking_env.env), episode_length=40 * L)
-    state = states.init(agent, spec, key=jax.random.key(0))
+    state = levels.init(agent, spec, key=jax.random.key(0))
     n, rng = int(state.abstraction.count), np.random.default_rng(0)
     q = rng.uniform(-1, 1, state.commander.q.shape).astype(np.float32)
     state = state.replace(commander=state.commander.replace(q=jnp.asarray(q)))
     middles = (state.abstraction.lower + state.abstraction.upper) / 2
-    allowed = np.asarray(episode.successors(agent, state).greedy)
+    roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
+    allowed = np.asarray(roadmap.allowed.greedy)
     route = rng.integers(0, 3, (25, B))  # regions in which decisions are made
+    playing = levels.of(agent, spec, greedy=True)
+    streams = play.start(playing, breaking_env, decisions=40, key=jax.random.key(2))
+    seen, memory = scene_of(spec, streams.env), streams.memory
 
-    def told(streams, where):
-        obs = streams.env.obs.at[:, np.asarray(spec.abstract_indices)].set(middles[where])
-        streams = streams.replace(env=streams.env.replace(obs=obs), clock=jnp.zeros(B, jnp.int32))
-        return episode.command(
-            agent, spec, state, episode.successors(agent, state), streams, epsilon=0.0, key=jax.random.key(1)
+    @jax.jit
+    def told(memory, where):
+        there = seen._replace(position=middles[where])
+        memory = memory.replace(clock=jnp.zeros(B, jnp.int32))
+        key = jax.random.key(1)
+        return commander.command(
+            agent.commander, playing.task, state.commander, roadmap, memory, there, Marks(), env_steps=None, key=key
         )
 
-    streams = episode.start(spec, breaking_env, key=jax.random.key(2))
-    streams, told = streams.replace(past=jnp.full((B, 40, 2), -1)), jax.jit(told)
-    goal = [slow_locate(state.abstraction, point) for point in np.asarray(spec.goal_point(streams.env.obs))]
-    tried, before, changed = np.zeros((B, n, n)), np.asarray(streams.region), 0
+    goal = [slow_locate(state.abstraction, point) for point in np.asarray(seen.goal)]
+    tried, before, changed = np.zeros((B, n, n)), np.asarray(memory.region), 0
     target = np.zeros(B, int)
     for now in route:
-        streams = told(streams, now)
+        memory = told(memory, now)
         for b in range(B):
             if now[b] != before[b] >= 0:
                 tried[b, before[b], target[b]] += 1
@@ -350,7 +370,7 @@ def test_who_comes_back_to_a_region_makes_less_of_what_it_was_told_there(breakin
             known = values - (1 - retry ** tried[b, now[b]]) * np.abs(values)
             may = allowed[now[b], :n] | (np.arange(n) == now[b])
             best = int(np.argmax(np.where(may, known, -np.inf)))
-            assert streams.target[b] == best
+            assert memory.target[b] == best
             changed += best != int(np.argmax(np.where(may, values, -np.inf)))
-        before, target = now, np.asarray(streams.target)
+        before, target = now, np.asarray(memory.target)
     assert (changed > 20) == (retry < 1)

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from star import loading
+from star.abstraction.regions import Box
 from star.agent import tutor
-from star.agent.tutor import Box, Trace
+from star.agent.task import Task
+from star.agent.tutor import Trace
 from star.learners.replay import Transition
+from star.spec import Spec
 
 N, L = 6, 4
 SCALE = np.array([10.0, 5.0], np.float32)
@@ -22,7 +25,19 @@ def settings(**values):
 def test_it_sees_the_state_and_the_bounds_of_the_box(relative):
     state, here = jnp.array([[1.0, 2.0, 7.0]]), jnp.array([[1.0, 2.0]])
     box = Box(lower=jnp.array([[4.0, 4.0]]), upper=jnp.array([[8.0, 10.0]]))
-    seen = tutor.observe(settings(relative_bounds=relative), state, here, box)
+    spec = Spec(
+        state_dim=3,
+        action_size=1,
+        episode_length=1,
+        abstract_indices=(0, 1),
+        goal_indices=(0, 1),
+        subgoal_scale=(1.0, 1.0),
+        space=((0.0, 0.0), (9.0, 9.0)),
+        region_cuts=((), ()),
+        success_radius=1.0,
+    )
+    obs = jnp.concatenate([state, 9 + here], axis=-1)  # the goal comes last, and is not seen
+    seen = tutor.observe(settings(relative_bounds=relative), Task.of(loading.parse({}), spec), obs, box)
     bounds = [3, 2, 7, 8] if relative else [4, 4, 8, 10]
     np.testing.assert_array_equal(seen, [[1, 2, 7, *bounds]])
     np.testing.assert_array_equal(box.centre, [[6, 7]])

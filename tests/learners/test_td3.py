@@ -19,7 +19,8 @@ def settings(**values):
         "updates_per_rollout": 1,
         "tau": 0.1,
     } | values
-    return loading.parse({"controller": {"learner": "td3", "td3": values}}).controller.td3
+    small = {"trainer": {"num_envs": 6}, "tutor": {"enabled": False}}  # whose rollouts fit into such a buffer
+    return loading.parse({"controller": {"learner": "td3", "td3": values}, **small}).controller.td3
 
 
 EXAMPLE = Transition(

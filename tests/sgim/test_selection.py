@@ -249,7 +249,7 @@ def test_a_split_hands_every_remembered_goal_to_the_part_it_lies_in_and_compiles
     cut = regions.Cut(region=jnp.array(0), dimension=jnp.array(1), position=jnp.array(1.0))
     after, done = regions.split(state.abstraction, cut, min_width=0.1)
     assert bool(done)
-    parted = sgim.on_split(state, after, parent=jnp.array(0), child=state.abstraction.count)
+    parted = sgim.on_split(state, after, regions.Split(done, cut, state.abstraction.count))
     for part, above in ((0, False), (4, True)):
         mine = [(goal, competence) for goal, competence in in_time if (goal[1] >= 1.0) == above]
         assert int(parted.written[part]) == len(mine) > 0
@@ -384,8 +384,8 @@ def test_a_cut_alone_credits_no_strategy():
         state = update(CONFIG, state, choice_of([0, 0], [0, 1], [[0.5, 0.5], [0.5, 1.5]]), jnp.array([0.9, 0.1]))
     np.testing.assert_allclose(state.gains, 0, atol=1e-6)
     cut = regions.Cut(region=jnp.array(0), dimension=jnp.array(1), position=jnp.array(1.0))
-    after, _ = regions.split(state.abstraction, cut, min_width=0.1)
-    state = sgim.on_split(state, after, parent=jnp.array(0), child=state.abstraction.count)
+    after, done = regions.split(state.abstraction, cut, min_width=0.1)
+    state = sgim.on_split(state, after, regions.Split(done, cut, state.abstraction.count))
     for _ in range(2):
         state = update(CONFIG, state, choice_of([0, 4], [0, 1], [[0.5, 0.5], [0.5, 1.5]]), jnp.array([0.9, 0.1]))
     np.testing.assert_allclose(state.gains, 0, atol=1e-6)

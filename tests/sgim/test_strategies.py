@@ -8,16 +8,15 @@ from scipy import stats
 
 from envs.common.errors import UserError
 from star import loading
-from star.abstraction import refinement, regions
-from star.abstraction.refinement import Split
-from star.abstraction.regions import Cut
-from star.agent import commander
-from star.agent import epoch as hierarchy
-from star.agent import play as episode
-from star.agent import state as states
+from star.abstraction import regions
+from star.abstraction.regions import Change, Cut, Split
+from star.agent import commander, levels, play, q_learning, tutor, values
+from star.agent import epoch as learning
+from star.agent.decisions import Decision, Roadmap, Scene, Successors
 from star.learners import ppo, td3
 from star.learners.replay import Imitation, Transition
-from star.sgim import selection, strategies
+from star.sgim import lessons, selection, strategies
+from star.sgim.lessons import Marks
 from star.sgim.sections import SgimConfig
 from star.sgim.teachers import Demonstrations, nearest
 from star.spec import Spec
@@ -29,7 +28,7 @@ ACTS = {"name": "acts", "kind": "action", "source": "demos.npz"}
 
 
 assign = jax.jit(strategies.assign)
-learn = jax.jit(strategies.learn)
+learn = jax.jit(lessons.learn)
 
 
 def four_regions():
@@ -77,10 +76,15 @@ def located(point):
     )
 
 
-def test_nothing_is_kept_where_everything_is_left_as_ever():
-    assert strategies.init(settings(), four_regions()) is None
-    for values in ({"goals": True}, {"exploration": True}, {"refinement": True}, {"teachers": [GUIDE]}):
-        assert strategies.init(settings(**values), four_regions()) is not None
+def test_nothing_is_kept_where_everything_is_left_as_ever(tiny, breaking_env):
+    spec = Spec.of(breaking_env.env)
+
+    def kept(values):
+        return levels.init(loading.parse({**tiny, "sgim": values}).agent(), spec, key=jax.random.key(0)).sgim
+
+    assert kept({}) is None
+    for some in ({"goals": True}, {"exploration": True}, {"refinement": True}, {"teachers": [GUIDE]}):
+        assert kept(some) is not None
 
 
 def test_goals_stay_those_of_the_task_unless_they_may_be_chosen():
@@ -108,7 +112,7 @@ def test_each_teacher_shows_what_is_nearest_and_only_to_those_who_ask():
         assert int(lesson.leg[b]) == (0 if asked[b] == 1 else L)
         if asked[b] == 1:
             np.testing.assert_array_equal(lesson.waypoints[b], np.repeat(demos[0].waypoints[guide], L, axis=0))
-    np.testing.assert_array_equal(strategies.guided(config, lesson), asked == 1)
+    np.testing.assert_array_equal(lessons.guided(config, lesson), asked == 1)
 
 
 def test_own_decomposition_goes_by_way_of_what_is_mastered_best_in_a_region():
@@ -126,7 +130,7 @@ def test_own_decomposition_goes_by_way_of_what_is_mastered_best_in_a_region():
     assert all(any((point == one).all() for one in via) for point in first[mine])
     assert len(np.unique(first[mine], axis=0)) == 4
     np.testing.assert_array_equal(np.asarray(lesson.leg) == 0, mine)
-    assert not strategies.guided(config, lesson).any()
+    assert not lessons.guided(config, lesson).any()
 
 
 def test_own_decomposition_has_one_waypoint_however_many_teachers_show():
@@ -135,7 +139,7 @@ def test_own_decomposition_has_one_waypoint_however_many_teachers_show():
     mine = np.asarray(lesson.choice.strategy) == 1
     assert mine.any() and lesson.waypoints.shape[1] == L
     there = np.asarray(lesson.waypoints[:, 0])
-    after, _, to_point = strategies.impose(config, lesson, jnp.asarray(there))
+    after, _, to_point = lessons.impose(config, lesson, jnp.asarray(there))
     assert not to_point[mine].any() and (np.asarray(after.leg)[mine] == L).all()
 
 
@@ -148,7 +152,7 @@ def test_no_teacher_is_asked_more_often_than_his_budget_and_none_who_is_away():
         mine = np.asarray(lesson.choice.strategy)[np.asarray(taught)]
         asked += (mine == 1).sum()
         assert asked == 5 and not (mine == 2).any()
-        lesson = strategies.grade(lesson, jnp.ones(B, bool), jnp.ones(B), radius=0.5)
+        lesson = lessons.grade(lesson, jnp.ones(B, bool), jnp.ones(B), radius=0.5)
         state, metrics = learn(config, state, lesson)
         assert int(metrics["queries_guide"]) == 5
 
@@ -186,7 +190,7 @@ def test_ways_are_points_on_the_straight_legs_of_those_who_are_led():
     config = settings(teachers=[GUIDE, AIMS])
     lesson, start, _, _ = lesson_of(config)
     led = np.flatnonzero(np.asarray(lesson.choice.strategy) == 1)
-    paths, weight = strategies.ways(config, lesson, start, most=len(led) + 2, parts=5)
+    paths, weight = lessons.ways(config, lesson, start, most=len(led) + 2, parts=5)
     assert paths.shape == (len(led) + 2, lesson.waypoints.shape[1] * 5, 2) and weight.tolist() == [1.0] * len(led) + [
         0.0,
         0.0,
@@ -195,7 +199,7 @@ def test_ways_are_points_on_the_straight_legs_of_those_who_are_led():
         corners = [start[b], *lesson.waypoints[b]]
         expected = [np.linspace(a, b, 5) for a, b in zip(corners, corners[1:], strict=False)]
         np.testing.assert_allclose(path, np.concatenate(expected), atol=1e-5)
-    fewer, _ = strategies.ways(config, lesson, start, most=2, parts=5)
+    fewer, _ = lessons.ways(config, lesson, start, most=2, parts=5)
     np.testing.assert_array_equal(fewer, paths[:2])
 
 
@@ -205,7 +209,7 @@ def test_waypoints_are_passed_where_the_agent_is_near():
     leg = rng.integers(0, L + 1, B)
     config = settings(teachers=[GUIDE], waypoint_radius=1.2)
     lesson = lesson_of(config)[0].replace(waypoints=jnp.asarray(points), leg=jnp.asarray(leg))
-    after, coming, guided = jax.jit(strategies.impose)(config, lesson, jnp.asarray(position))
+    after, coming, guided = jax.jit(lessons.impose)(config, lesson, jnp.asarray(position))
     passed = 0
     for b in range(B):
         expected = leg[b]
@@ -226,7 +230,7 @@ def test_a_way_leaves_a_region_where_one_who_walks_it_first_does():
     leg = rng.integers(0, L + 1, B)
     lower, upper = (np.floor(position / 2) * 2 + side for side in (0, 2))
     lesson = lesson_of(config)[0].replace(waypoints=jnp.asarray(points), leg=jnp.asarray(leg))
-    found, leaves = jax.jit(lambda *known: strategies.onward(lesson, *known, parts=5))(position, lower, upper)
+    found, leaves = jax.jit(lambda *known: lessons.onward(lesson, *known, parts=5))(position, lower, upper)
     for b in range(B):
         corners = [position[b], *points[b, leg[b] :]]
         way = [p for a, c in zip(corners, corners[1:], strict=False) for p in np.linspace(a, c, 5, dtype=np.float32)]
@@ -238,13 +242,13 @@ def test_a_way_leaves_a_region_where_one_who_walks_it_first_does():
 
 
 def test_competence_is_how_much_nearer_the_first_episode_came():
-    lesson = strategies.begin(lesson_of(settings(goals=True))[0], jnp.full(B, 10.0), radius=2.0)
-    lesson = strategies.grade(lesson, jnp.arange(B) == 0, jnp.full(B, 6.0), radius=2.0)  # from 8 m to 4 m
+    lesson = lesson_of(settings(goals=True))[0].replace(away=jnp.full(B, 8.0))
+    lesson = lessons.grade(lesson, jnp.arange(B) == 0, jnp.full(B, 6.0), radius=2.0)  # from 8 m to 4 m
     assert float(lesson.competence[0]) == pytest.approx(0.5) and np.isnan(lesson.competence[1:]).all()
-    lesson = strategies.grade(lesson, jnp.ones(B, bool), jnp.full(B, 1.0), radius=2.0)
+    lesson = lessons.grade(lesson, jnp.ones(B, bool), jnp.full(B, 1.0), radius=2.0)
     assert float(lesson.competence[0]) == pytest.approx(0.5) and (lesson.competence[1:] == 1).all()
     away = lesson.replace(competence=jnp.full(B, jnp.nan))
-    worse = strategies.grade(away, jnp.ones(B, bool), jnp.full(B, 30.0), radius=2.0)
+    worse = lessons.grade(away, jnp.ones(B, bool), jnp.full(B, 30.0), radius=2.0)
     assert (worse.competence == 0).all()
 
 
@@ -260,7 +264,7 @@ def test_only_what_is_taught_is_learnt_from():
     assert float(metrics["share_babbling"]) == pytest.approx((asked == 1).mean())
     assert float(metrics["share_autonomous"] + metrics["share_babbling"]) == pytest.approx(1)
     np.testing.assert_array_equal(
-        strategies.babbles(config, lesson), np.asarray(taught) & (np.asarray(lesson.choice.strategy) == 1)
+        lessons.babbles(config, lesson), np.asarray(taught) & (np.asarray(lesson.choice.strategy) == 1)
     )
 
 
@@ -273,10 +277,10 @@ def test_edges_to_what_is_half_mastered_and_stands_still_are_the_most_urgent():
         jnp.repeat(levels[:, None], window, axis=1).at[3, : window // 2].set(0.2).at[3, window // 2 :].set(0.8)
     )
     state = state.replace(competences=competences, written=jnp.full(6, window))
-    weight = np.asarray(strategies.urgency(config, state))
+    weight = np.asarray(lessons.urgency(config, state))
     assert weight[2] == pytest.approx(1) and weight[0] == weight[1] == pytest.approx(0.1)
     assert weight[0] < weight[3] < weight[2]
-    assert strategies.urgency(settings(goals=True), state) == 1.0
+    assert lessons.urgency(settings(goals=True), state) == 1.0
 
 
 def test_random_targets_follow_their_attraction():
@@ -285,9 +289,9 @@ def test_random_targets_follow_their_attraction():
     allowed = jnp.ones((size, size), bool).at[:, 1].set(False)
     attraction = jnp.array([0.1, 0.4, 0.2, 0.3, 0.0])
     zeros = jnp.zeros(n, jnp.int32)
-    targets = commander.act(
+    targets = values.choose(
         state,
-        commander.Successors(allowed, allowed),
+        Successors(allowed, allowed),
         zeros,
         zeros,
         attraction=attraction,
@@ -304,8 +308,8 @@ def test_targets_that_hardly_attract_are_drawn_evenly_among_themselves():
     state = commander.init(loading.parse({}).commander, regions=size)
     allowed = jnp.ones((size, size), bool).at[:, 0].set(False)
     zeros = jnp.zeros(n, jnp.int32)
-    successors, attraction = commander.Successors(allowed, allowed), jnp.array([1.0, 1e-4, 1e-4, 1e-4])
-    targets = commander.act(
+    successors, attraction = Successors(allowed, allowed), jnp.array([1.0, 1e-4, 1e-4, 1e-4])
+    targets = values.choose(
         state, successors, zeros + 1, zeros + 1, attraction=attraction, epsilon=1.0, key=jax.random.key(0)
     )
     assert stats.chisquare(np.bincount(targets, minlength=size)[1:]).pvalue > 1e-3
@@ -315,9 +319,9 @@ def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
     config = loading.parse({"commander": {"learner": "q", "learning_rate": 0.5, "reward": "mean"}}).commander
     state = commander.init(config, regions=3)
     state = state.replace(q=state.q.at[0, 1].set(jnp.array([0.0, 1.0, 0.4])))
-    allowed = commander.Successors(jnp.ones((3, 3), bool), jnp.ones((3, 3), bool))
+    allowed = Successors(jnp.ones((3, 3), bool), jnp.ones((3, 3), bool))
     one = lambda value: jnp.full(1, value)  # noqa: E731
-    decision = commander.Decision(
+    decision = Decision(
         region=one(0),
         goal_region=one(1),
         target=one(2),
@@ -331,11 +335,14 @@ def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
         shown=one(1.0),
     )
     alone = state.q[0, 1, 2]  # a waypoint tells nothing of what its region is worth
-    assert commander.observe(config, state, allowed, decision.replace(shown=None)).q[0, 1, 2] == alone
-    taught = commander.observe(config, state, allowed, decision, margin=0.2).q[0, 1, 2]
-    assert float(taught) == pytest.approx(float(alone) + 0.5 * (1.0 + 0.2 - float(alone)))
-    ignored = commander.observe(config, state, allowed, decision.replace(shown=one(0.0)), margin=0.2).q[0, 1, 2]
-    assert float(ignored) == pytest.approx(float(alone))
+    roadmap = Roadmap(abstraction=None, allowed=allowed, believed=None)
+
+    def learnt(shown, **margin):
+        return float(q_learning.observe(config, state, roadmap, decision.replace(shown=shown), **margin).q[0, 1, 2])
+
+    assert learnt(None) == alone
+    assert learnt(one(1.0), margin=0.2) == pytest.approx(float(alone) + 0.5 * (1.0 + 0.2 - float(alone)))
+    assert learnt(one(0.0), margin=0.2) == pytest.approx(float(alone))
 
 
 @pytest.mark.parametrize("learner", [ppo, td3])
@@ -343,7 +350,9 @@ def test_the_actor_comes_near_to_demonstrated_actions(learner):
     name = learner.__name__.rsplit(".", 1)[-1]
     small = {"hidden": [16], "batch_size": 8, "buffer_size": 64, "policy_delay": 1, "actor_learning_rate": 1e-2}
     values = {"hidden": [16], "passes": 1, "minibatches": 1, "learning_rate": 1e-3} if learner is ppo else small
-    config = getattr(loading.parse({"controller": {"learner": name, name: values}}).controller, name)
+    alone = {"tutor": {"enabled": False}}
+    parsed = loading.parse({"controller": {"learner": name, name: values}, "trainer": {"num_envs": 4}, **alone})
+    config = parsed.controller.settings
     rng = np.random.default_rng(0)
     noise = lambda *shape: jnp.asarray(rng.normal(size=(4, 8, *shape)), jnp.float32)  # noqa: E731
     nothing, whole = jnp.zeros((4, 8)), jnp.ones((4, 8))
@@ -377,7 +386,7 @@ def test_the_actor_comes_near_to_demonstrated_actions(learner):
 
 def test_steps_of_demonstrations_lead_to_the_end_of_their_segment():
     demos = demonstrations()
-    drawn = strategies.shown(demos, 3, size=200, key=jax.random.key(0))
+    drawn = lessons.shown(demos, 3, size=200, key=jax.random.key(0))
     states, lengths = np.asarray(demos.states), np.asarray(demos.lengths)
     seen = set()
     for state, later, action, outcome in zip(
@@ -432,10 +441,10 @@ def schooled(tiny, breaking_env):
     @jax.jit
     def epoch(state):
         traces.append(0)
-        return hierarchy.epoch(parsed.agent(), spec, breaking_env, state, teachers)
+        return learning.epoch(parsed.agent(), spec, breaking_env, state, teachers)
 
     # With this key a region is cut, which is rare in so few epochs.
-    state = jax.jit(lambda key: states.init(parsed.agent(), spec, key=key))(jax.random.key(22))
+    state = jax.jit(lambda key: levels.init(parsed.agent(), spec, key=key))(jax.random.key(22))
     seen, metrics = [state], []
     for _ in range(3):
         state, more = epoch(state)
@@ -458,9 +467,9 @@ def test_sgim_follows_the_agent_through_its_epochs(schooled):
     assert np.isfinite(remembered).all() and (remembered > 0).any()
 
 
-def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env, monkeypatch):
+def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env):
     agent, spec = loading.parse({**tiny, "sgim": {"goals": True}}).agent(), Spec.of(breaking_env.env)
-    before = states.init(agent, spec, key=jax.random.key(0))
+    before = levels.init(agent, spec, key=jax.random.key(0))
     last = int(before.abstraction.count)
     cuts = [Cut(jnp.int32(15), jnp.int32(0), jnp.float32(9.0)), Cut(jnp.int32(last), jnp.int32(1), jnp.float32(5.0))]
     undone = Cut(jnp.int32(3), jnp.int32(0), jnp.float32(-2.0))
@@ -469,18 +478,40 @@ def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env, monkey
         table, _ = regions.split(table, cut, min_width=0.01)
     splits = [Split(jnp.array(True), cut, jnp.int32(last + i)) for i, cut in enumerate(cuts)]
     splits.append(Split(jnp.array(False), undone, jnp.int32(last + 1)))
-    stacked = jax.tree.map(lambda *parts: jnp.stack(parts), *splits)
-    monkeypatch.setattr(refinement, "refine", lambda *_, **__: (table, before.graph, stacked, {}))
+    change = Change.of(before.abstraction, table, jax.tree.map(lambda *parts: jnp.stack(parts), *splits))
     goals = jnp.array([[5.0, 1.0], [12.0, 3.0], [12.0, 8.0]])  # below the first cut, below and above the second
     known = before.sgim.replace(
         goals=before.sgim.goals.at[15, :3].set(goals),
         competences=before.sgim.competences.at[15, :3].set(jnp.array([0.1, 0.2, 0.3])),
         written=before.sgim.written.at[15].set(3),
+        episodes=before.sgim.episodes.at[15].set(8.0),
     )
-    after, _ = hierarchy.refine(agent, spec, before.replace(sgim=known), None, key=jax.random.key(0))
-    jax.tree.map(np.testing.assert_array_equal, after.sgim.abstraction, table)
-    assert after.sgim.written[jnp.array([15, last, last + 1])].tolist() == [1, 1, 1]
-    np.testing.assert_allclose(selection.competence(after.sgim)[jnp.array([15, last, last + 1])], [0.1, 0.2, 0.3])
+    after = lessons.follow(known, change)
+    jax.tree.map(np.testing.assert_array_equal, after.abstraction, table)
+    parts = jnp.array([15, last, last + 1])
+    assert after.written[parts].tolist() == [1, 1, 1]
+    assert after.episodes[parts, 0].tolist() == [4, 2, 2]  # halved at each cut
+    np.testing.assert_allclose(selection.competence(after)[parts], [0.1, 0.2, 0.3])
+
+
+def commanded_in(playing, state, streams, lesson, *, key):
+    """The memory of a greedy Commander under a lesson, which is due everywhere, and what the lesson says."""
+    config, spec, obs = playing.config, playing.task.spec, streams.env.obs
+    scene = Scene(spec.abstract(obs), spec.goal_point(obs), streams.env.metrics["success"])
+    roadmap = Roadmap.of(config.commander, state.abstraction, state.graph)
+    _, marks = lessons.mark(config.sgim, lesson, state.abstraction, scene.position, due=jnp.ones(len(obs), bool))
+    memory = commander.command(
+        config.commander,
+        playing.task,
+        state.commander,
+        roadmap,
+        streams.memory,
+        scene,
+        marks,
+        env_steps=None,
+        key=key,
+    )
+    return memory, marks, roadmap
 
 
 def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(tiny, breaking_env):
@@ -490,19 +521,19 @@ def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(t
     )
     n = breaking_env.num_envs
     lesson = jax.tree.map(lambda x: x[:n], lesson_of(agent.sgim)[0])
-    led = np.asarray(strategies.guided(agent.sgim, lesson))
+    led = np.asarray(lessons.guided(agent.sgim, lesson))
+    playing = levels.of(agent, spec)
 
     @jax.jit
     def commanded(key, waypoints):
-        state = states.init(agent, spec, key=key)
-        streams = episode.start(spec, breaking_env, key=key)
-        streams = streams.replace(lesson=lesson.replace(waypoints=waypoints))
-        allowed = episode.successors(agent, state)
-        return state.abstraction, episode.command(agent, spec, state, allowed, streams, epsilon=0.0, key=key)
+        state = levels.init(agent, spec, key=key)
+        streams = play.start(playing, breaking_env, decisions=1, key=key)
+        memory, *_ = commanded_in(playing, state, streams, lesson.replace(waypoints=waypoints), key=key)
+        return state.abstraction, spec.goal_point(streams.env.obs), memory
 
-    goal = spec.goal_point(commanded(jax.random.key(0), lesson.waypoints)[1].env.obs)
+    _, goal, _ = commanded(jax.random.key(0), lesson.waypoints)
     beside = jnp.asarray([[-0.1, 0.1], [0.3, 0.1]])[None] * jnp.ones((n, 1, 1))  # two regions on, then to the goal
-    table, after = commanded(jax.random.key(0), jnp.concatenate([beside, goal[:, None]], axis=1))
+    table, _, after = commanded(jax.random.key(0), jnp.concatenate([beside, goal[:, None]], axis=1))
     locate = lambda p: int(regions.locate(table, jnp.asarray(p, jnp.float32)))  # noqa: E731
     for b in np.flatnonzero(led):
         corners = [after.start[b], *beside[b], goal[b]]
@@ -511,31 +542,35 @@ def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(t
         assert int(after.target[b]) == onward != int(after.goal_region[b])
         np.testing.assert_array_equal(after.box.lower[b], table.lower[onward])
         np.testing.assert_array_equal(after.box.upper[b], table.upper[onward])
-    _, direct = commanded(jax.random.key(0), jnp.repeat(goal[:, None], 3, axis=1) + 0.5)
+    *_, direct = commanded(jax.random.key(0), jnp.repeat(goal[:, None], 3, axis=1) + 0.5)
     arriving = led & (np.asarray(direct.target) == np.asarray(direct.goal_region))
     assert arriving.any()
     np.testing.assert_allclose(direct.box.centre[arriving], goal[arriving], atol=1e-4)  # as without a teacher
 
 
 def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_tutor_imitates_them(
-    tiny, breaking_env, turning
+    tiny, breaking_env, turning, monkeypatch
 ):
     agent = loading.parse({**tiny, "sgim": {"teachers": [GUIDE], "imitation": 2.0}}).agent()
     lesson, _, _, _ = lesson_of(agent.sgim)
     n = breaking_env.num_envs
     lesson = jax.tree.map(lambda x: x[:n], lesson)
-    led = np.asarray(strategies.guided(agent.sgim, lesson))
+    led = np.asarray(lessons.guided(agent.sgim, lesson))
     assert led.any() and not led.all()
+    playing = levels.of(agent, turning)
 
     def chosen(key, lesson):
-        state = states.init(agent, turning, key=key)
-        streams = episode.start(turning, breaking_env, key=key).replace(lesson=lesson)
-        began = streams.env.obs
-        subgoal, action = episode.choose_subgoal(agent, turning, state, streams, deterministic=False, key=key)
-        after, steps = episode.rollout(
-            agent, turning, breaking_env, state, streams, subgoal, deterministic=False, key=key
-        )
-        return began, subgoal, hierarchy._tutor_transition(agent, turning, after, began, action, steps)
+        state = levels.init(agent, turning, key=key)
+        streams = play.start(playing, breaking_env, key=key)
+        obs, marks = streams.env.obs, Marks()
+        if lesson is not None:
+            nowhere, position = jnp.zeros(n, bool), turning.abstract(obs)
+            _, marks = lessons.mark(agent.sgim, lesson, state.abstraction, position, due=nowhere)
+        box = streams.memory.box
+        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, box, marks, explore=True, key=key)
+        _, passed = play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)
+        learnt = tutor.experience(agent.tutor, playing.task, passed, marks, renewed=jnp.zeros(n, bool))
+        return obs, choice.subgoal, learnt
 
     obs, subgoal, decisions = jax.jit(chosen)(jax.random.key(0), lesson)
     alone = jax.jit(chosen)(jax.random.key(0), None)[1]
@@ -548,29 +583,35 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
 
     np.testing.assert_array_equal(decisions.weight, ~led)  # what is shown is no experience of the Tutor's own
     stacked = jax.tree.map(lambda x: jnp.stack([x, x]), decisions)
-    imitation = hierarchy._shown_subgoals(agent, stacked, jnp.stack([led, led * 0.0]))
+    taken = []
+    monkeypatch.setattr(tutor.learners, "update", lambda *_, imitation, **__: taken.append(imitation) or (None, {}))
+    for shown in (jnp.stack([led, led & False]), None):
+        imitate = lessons.imitating(agent.sgim, shown)
+        tutor.learn(
+            agent.tutor, playing.task, None, stacked, below=None, penalty=None, imitate=imitate, key=jax.random.key(0)
+        )
+    imitation, nothing = taken
     np.testing.assert_array_equal(imitation.action, np.concatenate([decisions.action, decisions.action]))
     assert float(imitation.weight.mean()) == pytest.approx(2) and imitation.weight.shape == (2 * n,)
     np.testing.assert_array_equal(np.asarray(imitation.weight) > 0, np.concatenate([led, led & False]))
-    assert hierarchy._shown_subgoals(agent, stacked, None) is None
+    assert nothing is None
 
 
 def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, breaking_env):
     agent, spec = loading.parse({**tiny, "sgim": {"teachers": [GUIDE]}}).agent(), Spec.of(breaking_env.env)
-    state = states.init(agent, spec, key=jax.random.key(0))
+    state = levels.init(agent, spec, key=jax.random.key(0))
     i, j = map(
         int,
         np.argwhere(np.asarray(regions.adjacent(state.abstraction)) & ~np.eye(len(state.graph.told), dtype=bool))[0],
     )
     nothing = jnp.zeros(3, jnp.int32)
-    decision = commander.Decision(*[nothing] * 3, *[jnp.zeros(3)] * 1, nothing, *[jnp.zeros(3)] * 5)
-    allowed = episode.successors(agent, state)
-    last = agent.commander.period // agent.tutor.period - 1
+    decision = Decision(*[nothing] * 3, *[jnp.zeros(3)] * 1, nothing, *[jnp.zeros(3)] * 5)
 
     def value(told):
         graph = state.graph.replace(told=state.graph.told.at[i, j].set(told))
-        known = state.replace(graph=graph)
-        return hierarchy._command_better(agent, known, allowed, decision, jnp.int32(last)).model.reach[i, j, j]
+        roadmap = Roadmap.of(agent.commander, state.abstraction, graph)
+        known = commander.observe(agent.commander, state.commander, roadmap, decision, due=jnp.array(True))
+        return known.model.reach[i, j, j]
 
     assert float(value(-1)) < float(value(0)) == float(value(1))
 
@@ -581,24 +622,25 @@ def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, 
     lesson = jax.tree.map(lambda x: x[: breaking_env.num_envs], lesson_of(agent.sgim)[0])
     babbling, detour = (np.asarray(lesson.choice.strategy) == number for number in (1, 2))
     assert babbling.any() and detour.any() and not (babbling | detour).all()
+    playing = levels.of(agent, spec)
 
     @jax.jit
     def finished(key, terminated):
-        state = states.init(agent, spec, key=key)
-        streams = episode.start(spec, breaking_env, key=key).replace(lesson=lesson)
-        allowed = episode.successors(agent, state)
-        streams = episode.command(agent, spec, state, allowed, streams, epsilon=0.0, key=key)
-        subgoal, _ = episode.choose_subgoal(agent, spec, state, streams, deterministic=False, key=key)
-        streams, steps = episode.rollout(
-            agent, spec, breaking_env, state, streams, subgoal, deterministic=False, key=key
-        )
-        ones = jnp.ones_like(steps.alive)
-        steps = steps.replace(alive=ones, ended=0 * ones, terminated=terminated * ones)
-        return hierarchy.finished_period(agent, spec, state, streams.replace(clock=0 * streams.clock), steps)
+        state = levels.init(agent, spec, key=key)
+        streams = play.start(playing, breaking_env, decisions=1, key=key)
+        memory, marks, roadmap = commanded_in(playing, state, streams, lesson, key=key)
+        obs, section = streams.env.obs, agent.commander
+        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, memory.box, marks, explore=True, key=key)
+        streams = streams.replace(memory=memory)
+        _, passed = play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)
+        ones = jnp.ones_like(passed.alive)
+        passed = passed.replace(alive=ones, ended=0 * ones, terminated=terminated * ones)
+        last = memory.replace(clock=memory.clock + section.period - agent.tutor.period)
+        return commander.experience(section, playing.task, roadmap, last, passed, marks)[1]
 
     decision, outcome = finished(jax.random.key(0), 0.0)
     np.testing.assert_array_equal(decision.aside, detour)
-    for told in (decision.weight, finished(jax.random.key(0), 1.0)[0].lost, outcome.weight):
+    for told in (decision.weight, finished(jax.random.key(0), 1.0).decision.lost, outcome.weight):
         np.testing.assert_array_equal(np.asarray(told) > 0, ~babbling)
 
 

@@ -1,0 +1,131 @@
+"""What is learnt of the regions between two episodes, once all periods of the epoch are known.
+
+    forward model    learns from the epoch's complete periods, after its error on them was measured
+    refinement       examines pairs of regions and cuts some
+    Commander, SGIM  follow the cuts; the Commander fades and plans anew
+
+Periods cut short by the end of an episode teach the forward model nothing, because they did not last k steps.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from star.abstraction import forward_model, refinement
+from star.abstraction.forward_model import Outcome
+from star.abstraction.refinement import Goals
+from star.agent import commander
+from star.agent.decisions import Decision, Finished, Roadmap
+from star.agent.sections import AgentConfig
+from star.agent.state import TrainState
+from star.agent.values import CommanderState
+from star.learners.replay import weighted_mean
+from star.spec import Spec
+
+Metrics = dict[str, Array]
+
+
+def learn(
+    config: AgentConfig,
+    spec: Spec,
+    guide: ModuleType,
+    state: TrainState,
+    *,
+    known: CommanderState,
+    finished: Finished,
+    num_envs: int,
+    env_steps: Array,
+    key: Array,
+) -> tuple[TrainState, Metrics]:
+    """The state after an epoch with the periods `finished` [N], in today's regions.
+
+    `known` is the Commander before the epoch, and `env_steps` are those of all environments before it.
+    """
+    section = config.commander
+    pick_key, train_key, refine_key = jax.random.split(key, 3)
+    roadmap = Roadmap.of(section, state.abstraction, state.graph)
+    metrics = {
+        f"commander/{k}": x for k, x in commander.measure(section, state.commander, roadmap, finished[0]).items()
+    }
+    periods = num_envs * (spec.episode_length // section.period)
+    decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
+    goals = Goals.of(outcome, decision.at_goal, radius=spec.success_radius)
+    state, more = _learn_where_commands_lead(config, state, decision, outcome, key=train_key)
+    metrics |= more
+    if config.refinement.enabled:
+        state, more = refine(config, spec, guide, state, goals, known=known, finished=finished, key=refine_key)
+        metrics |= more
+    roadmap = Roadmap.of(section, state.abstraction, state.graph)
+    planned = commander.plan(section, commander.fade(section, state.commander), roadmap)
+    metrics |= {
+        "abstraction/regions": state.abstraction.count,
+        "commander/epsilon": commander.epsilon(section, env_steps),
+    }
+    return state.replace(commander=planned), metrics
+
+
+def nothing(config: AgentConfig, spec: Spec, guide: ModuleType, state: TrainState, **_: object) -> tuple:
+    """Without a Commander nobody needs regions: the state as it is, no metrics."""
+    return state, {}
+
+
+def refine(
+    config: AgentConfig,
+    spec: Spec,
+    guide: ModuleType,
+    state: TrainState,
+    goals: Goals,
+    *,
+    known: CommanderState,
+    finished: Finished,
+    key: Array,
+) -> tuple[TrainState, Metrics]:
+    """Examine pairs and cut regions; the Commander and SGIM follow."""
+    graph, change, metrics = refinement.refine(
+        config,
+        state.abstraction,
+        state.graph,
+        state.forward_model,
+        goals,
+        radius=spec.success_radius,
+        weight=guide.urgency(config.sgim, state.sgim),
+        key=key,
+    )
+    state = state.replace(
+        abstraction=change.after,
+        graph=graph,
+        commander=commander.follow(config.commander, state.commander, change, known, finished),
+        sgim=guide.follow(state.sgim, change),
+    )
+    return state, {f"refinement/{name}": value for name, value in metrics.items()}
+
+
+def _learn_where_commands_lead(
+    config: AgentConfig, state: TrainState, decision: Decision, outcome: Outcome, *, key: Array
+) -> tuple[TrainState, Metrics]:
+    """The forward model after complete periods, and the graph with how well it had predicted them."""
+    section = config.forward_model
+    if section.boxes == "reached":
+        lower, upper = (corner[decision.next_region] for corner in (state.abstraction.lower, state.abstraction.upper))
+        outcome = outcome.replace(lower=lower, upper=upper)
+    error = forward_model.errors(section, state.forward_model, outcome)
+    counted = outcome.weight * (1 - decision.aside) * (decision.at_goal == (decision.region == decision.target))
+    graph = refinement.observe(
+        config, state.graph, region=decision.region, target=decision.target, error=error, weight=counted
+    )
+    model, metrics = forward_model.train(section, state.forward_model, outcome, key=key)
+    metrics |= {"error": jnp.sqrt(weighted_mean(error, outcome.weight))}
+    return state.replace(forward_model=model, graph=graph), {
+        f"forward_model/{name}": value for name, value in metrics.items()
+    }
+
+
+def _complete(finished: Finished, size: int, *, key: Array) -> Finished:
+    """A random `size` of the complete ones among all recorded periods, first by weight."""
+    weight = finished.outcome.weight
+    order = jnp.argsort(weight + jax.random.uniform(key, weight.shape, maxval=0.5), descending=True)[:size]
+    return jax.tree.map(lambda x: x[order], finished)

@@ -1,0 +1,67 @@
+"""No Commander: the goal is commanded all the time, as in HIRO. Nothing is learnt of regions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from envs.common.batching import where
+from star.abstraction import regions
+from star.agent.commander import blank, init
+from star.agent.decisions import Finished, Memory, Roadmap, Scene, target_box
+from star.agent.sections import CommanderConfig
+from star.agent.segments import Segment
+from star.agent.task import Task
+
+__all__ = ["ahead_of_time", "begin", "command", "experience", "init", "observe", "renewed", "settle"]
+
+
+def begin(section: CommanderConfig, position: Float[Array, "B d"], *_: Any, **__: Any) -> Memory:
+    """Nobody practises: there is nobody to send them."""
+    return blank(position)
+
+
+def command(
+    section: CommanderConfig,
+    task: Task,
+    state: Any,
+    roadmap: Roadmap,
+    memory: Memory,
+    scene: Scene,
+    *_: Any,
+    **__: Any,
+) -> Memory:
+    """The box around the goal where the clock is 0; dimensions that the goal leaves open have its region's bounds."""
+    region = regions.locate(roadmap.abstraction, scene.goal)
+    everywhere = jnp.ones(len(region), bool)
+    box = target_box(task, roadmap.abstraction, region, around=everywhere, point=scene.goal)
+    return where(memory.clock == 0, memory.replace(goal_region=region, target=region, box=box), memory)
+
+
+def experience(
+    section: CommanderConfig, task: Task, roadmap: Roadmap, memory: Memory, segment: Segment, *_: Any
+) -> tuple[Memory, Finished]:
+    """Periods pass, and nothing is told of them."""
+    return memory.replace(clock=(memory.clock + len(segment.alive)) % section.period), Finished(None, None)
+
+
+def renewed(memory: Memory) -> Bool[Array, "B"]:
+    """Nowhere does another target follow before the episode ends."""
+    return jnp.zeros(len(memory.clock), bool)
+
+
+def ahead_of_time(section: CommanderConfig, roadmap: Roadmap, memory: Memory, *_: Any) -> Memory:
+    """There is no target to arrive at before the goal."""
+    return memory
+
+
+def observe(section: CommanderConfig, state: Any, *_: Any, **__: Any) -> Any:
+    """Nothing is learnt."""
+    return state
+
+
+def settle(section: CommanderConfig, state: Any, *_: Any, **__: Any) -> Any:
+    """Greedy episodes are commanded alike."""
+    return state

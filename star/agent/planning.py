@@ -1,0 +1,240 @@
+"""Planning on a learnt model of the regions, the Commander's default learner.
+
+Where the command of a region leads does not depend on the goal, so decisions teach about all other goals. Counts of
+(i, j) -> i' and mean rewards make a model of the regions, on which value iteration runs once a period:
+
+    Q[i, g, j] <- r[i, g, j] + gamma sum_i' P(i' | i, j) max_j' Q[i', g, j']
+
+Commanding the goal's own region is another thing, for the Tutor is then given the goal: P(i' | i, g) is counted apart,
+and believed to be as where the goal is elsewhere.
+The probabilities of i' sum to less than 1 where episodes were lost (terminated). What was not tried is believed to
+succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
+region gets there. `prior` decisions weigh as much as this belief. Where regions were cut, the epoch's decisions are
+counted anew by today's regions (`follow`). Greedy episodes, in which nothing is learnt, follow a plan with hardly any
+of it (`settle`).
+
+Those who practise pursue a region by the same plan with another reward, 1 in the region pursued.
+
+Source: optimistic model, R-max (Brafman and Tennenholtz 2002).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from star.abstraction import regions
+from star.abstraction.regions import Change
+from star.agent.decisions import Decision, Finished, Roadmap, Successors
+from star.agent.sections import CommanderConfig
+from star.agent.values import CommanderState, Model, best
+
+_HUNCH = 0.1  # what belief is worth where nothing is to be tried
+_HABIT = 0.1  # share by which a command that nobody follows has to be better than the usual one
+
+
+def init(*, regions: int) -> Model:
+    """Nothing counted."""
+    cube = jnp.zeros((regions, regions, regions))
+    both = jnp.stack([cube, cube])
+    return Model(led=both, rewards=cube, visits=cube, lost=both[:, 0], reach=cube)
+
+
+def observe(
+    section: CommanderConfig,
+    state: CommanderState,
+    roadmap: Roadmap,
+    batch: Decision,
+    *,
+    margin: Float[Array, ""] | float = 0.0,
+) -> CommanderState:
+    """Count what the streams decided at one instant; teachers count like all others."""
+    return state.replace(model=_counted(_model(state), batch, cells=batch))
+
+
+def plan(
+    section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, due: Bool[Array, ""] | None = None
+) -> CommanderState:
+    """Values by what is known now, where it is `due` (None: now)."""
+    now = partial(_plan, section, roadmap)
+    return now(state) if due is None else jax.lax.cond(due, now, lambda same: same, state)
+
+
+def _plan(section: CommanderConfig, roadmap: Roadmap, state: CommanderState) -> CommanderState:
+    """`section.sweeps` sweeps of value iteration on the model, from the values of last time.
+
+    As long as nothing is known, region j is held reachable from i where `believed` [i, j], and who aims at a goal in
+    his own region is taken to succeed (or, with rewards that are negative, to lose nothing anywhere).
+    """
+    model = _model(state)
+    chances, reward = _expectations(section, model, roadmap.believed, belief=1.0)
+    pursued = jnp.broadcast_to(jnp.eye(state.chosen.shape[0])[..., None], reward.shape)
+    values, rewards = jnp.stack([state.q, model.reach]), jnp.stack([reward, pursued])
+    q, reach = _iterated(section, roadmap.allowed, values, rewards, chances, sweeps=section.sweeps)
+    return state.replace(q=q, model=model.replace(reach=reach))
+
+
+def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, periods: int) -> CommanderState:
+    """The Commander for greedy episodes of so many `periods`, with Q by what commands have led to.
+
+    The belief that what was not tried succeeds makes agents try it, which is of no use where nothing is learnt: here it
+    only decides among what is unknown, and none of it is left over, as this plan begins from nothing. Of commands that
+    look about as good the usual one is better known: regions are coarse, and what leads on where agents stood when they
+    tried it may lead nowhere from where they enter. So what was chosen less often is worth a little less. Q stays as it
+    is with rewards by distance, of which nothing is the best.
+    """
+    if section.reward != "success":
+        return state
+    chances, reward = _expectations(section, _model(state), roadmap.believed, belief=_HUNCH)
+    q = _iterated(section, roadmap.allowed, jnp.zeros_like(state.q)[None], reward[None], chances, sweeps=periods)[0]
+    visits = _model(state).visits
+    usual = visits / jnp.maximum(visits.max(axis=-1, keepdims=True), 1.0)
+    return state.replace(q=q * (1 - _HABIT * (1 - usual)))
+
+
+def fade(section: CommanderConfig, state: CommanderState) -> Model:
+    """Let one epoch pass: the lower levels have learnt, so old decisions count less."""
+    model = _model(state)
+    return jax.tree.map(lambda x: section.memory * x, model).replace(reach=model.reach)
+
+
+def follow(
+    section: CommanderConfig, state: CommanderState, change: Change, earlier: Model, finished: Finished
+) -> Model:
+    """The model after an epoch whose regions were cut, so that region j of today is (a part of) `origin` [j] of then.
+
+    It becomes the `earlier` one, with which the epoch began, and all decisions of the epoch, `finished`, counted anew
+    by today's regions.
+    """
+    find = partial(regions.locate, change.after)
+    decision, outcome = finished
+    goal_region = find(decision.goal)
+    cells = decision.replace(
+        region=find(outcome.start),
+        next_region=find(outcome.end),
+        goal_region=goal_region,
+        target=jnp.where(decision.at_goal, goal_region, decision.target),
+    )
+    model = recounted(section, earlier, decision, cells, change.origin)
+    origin = change.origin
+    cube = (origin[:, None, None], origin[:, None], origin)
+    return model.replace(reach=_model(state).reach[cube])
+
+
+def recounted(
+    section: CommanderConfig, earlier: Model, batch: Decision, cells: Decision, origin: Int[Array, "R"]
+) -> Model:
+    """The `earlier` model and the decisions of `batch`, but for `reach`.
+
+    `cells` holds them with today's regions, but for the targets, which count as all their parts unless they were goals.
+    """
+    parts = jnp.zeros(len(origin)).at[origin].add(1.0)[origin]
+    counted = _counted(jax.tree.map(jnp.zeros_like, earlier), batch, cells=cells)
+    beside, own = _beside(origin), jnp.eye(len(origin), dtype=bool)
+    to_parts = lambda table: table.at[0].set(table[0][:, origin])  # noqa: E731
+    in_pursuit = lambda table: jnp.where(own, table, jnp.where(beside, 0.0, table[..., origin]))  # noqa: E731
+    new = counted.replace(
+        led=to_parts(counted.led),
+        lost=to_parts(counted.lost),
+        rewards=in_pursuit(counted.rewards),
+        visits=in_pursuit(counted.visits),
+    )
+    old = _inherited(section, earlier, new, origin, parts)
+    return jax.tree.map(jnp.add, old, new)
+
+
+def _counted(model: Model, batch: Decision, *, cells: Decision) -> Model:
+    """`model` with the decisions of `batch`, in the tables' cells that the regions of `cells` say."""
+    direct = 1 - batch.aside
+    # Who practises and aims at the goal's region aims at its centre, which tells nothing of aiming at the goal.
+    beside = batch.practised * (batch.target == batch.goal_region)
+    telling = jnp.maximum(batch.weight, batch.lost) * direct * (1 - beside)
+    command = (batch.at_goal.astype(jnp.int32), cells.region, cells.target)
+    pursuit = (cells.region, cells.goal_region, cells.target)
+    return model.replace(
+        led=model.led.at[*command, cells.next_region].add(batch.weight * direct),
+        rewards=model.rewards.at[pursuit].add(telling * batch.reward),
+        visits=model.visits.at[pursuit].add(telling),
+        lost=model.lost.at[command].add(batch.lost * direct),
+    )
+
+
+def _expectations(
+    section: CommanderConfig, model: Model, believed: Bool[Array, "R R"], *, belief: float
+) -> tuple[Float[Array, "2 R R R"], Float[Array, "R R R"]]:
+    """P(i' | i, j) by aim, and r[i, g, j]: what was counted, and `belief` in what was not, else staying in place."""
+    identity = jnp.eye(believed.shape[0])
+    there, here = identity[None], identity[:, None]
+    expected = jnp.where(believed[..., None], belief * there + (1 - belief) * here, here)
+    counted = (model.led.sum(axis=-1) + model.lost + section.prior)[..., None]
+    to_region = (model.led[0] + section.prior * expected) / counted[0]
+    to_goal = (model.led[1] + section.prior * to_region) / counted[1]
+    chances = jnp.stack([to_region, to_goal])
+    arrived = (section.reward == "success") * belief * identity[:, :, None] * identity[:, None]
+    return chances, (model.rewards + section.prior * arrived) / (model.visits + section.prior)
+
+
+def _iterated(
+    section: CommanderConfig,
+    allowed: Successors,
+    values: Float[Array, "V R R R"],
+    rewards: Float[Array, "V R R R"],
+    chances: Float[Array, "2 R R R"],
+    *,
+    sweeps: int,
+) -> Float[Array, "V R R R"]:
+    """The tables `values` after sweeps of value iteration, each with its rewards; the first is that of goals."""
+    to_region, to_goal = chances
+    product = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
+    own = jnp.eye(values.shape[1], dtype=bool)
+
+    def sweep(values: Array, _: None) -> tuple[Array, None]:
+        future = jax.vmap(partial(best, allowed=allowed.greedy))(values)
+        later = product("ijn,vng->vigj", to_region, future)
+        at_goal = product("ign,ng->ig", to_goal, future[0])
+        later = later.at[0].set(jnp.where(own, at_goal[..., None], later[0]))
+        return rewards + section.discount * later, None
+
+    return jax.lax.scan(sweep, values, None, length=sweeps)[0]
+
+
+def _inherited(
+    section: CommanderConfig, earlier: Model, new: Model, origin: Int[Array, "R"], parts: Float[Array, "R"]
+) -> Model:
+    """Counts of before the epoch that cut each `origin` into so many `parts`, beside its own counts `new`.
+
+    Nobody knows any more where in a region these decisions began and ended. So those that may have begun in a part are
+    but a belief in what happens there, of `section.prior` decisions at most, as are rewards where the goal may have
+    been in a part, and all arrived in the parts as those of the epoch did. What aiming at the goal paid tells nothing
+    of aiming at a part in which the goal is not.
+    """
+    cube = (origin[:, None, None], origin[:, None], origin)
+    arrived = jnp.zeros_like(new.led).at[..., origin].add(new.led)[..., origin]
+    share = jnp.where(arrived > 0, new.led / jnp.where(arrived > 0, arrived, 1.0), 1 / parts)
+    led, lost = earlier.led[:, *cube] * share, earlier.lost[:, *cube[1:]]
+    beside = _beside(origin)
+    rewards, visits = (jnp.where(beside, 0.0, table[cube]) for table in (earlier.rewards, earlier.visits))
+
+    cut = parts[:, None] > 1
+    doubt = lambda number: section.prior / jnp.maximum(number, section.prior)  # noqa: E731
+    of_commands = jnp.where(cut, doubt(led.sum(axis=-1) + lost), 1.0)
+    of_pursuits = jnp.where(cut[:, None] | cut, doubt(visits), 1.0)
+    return earlier.replace(
+        led=led * of_commands[..., None],
+        lost=lost * of_commands,
+        rewards=rewards * of_pursuits,
+        visits=visits * of_pursuits,
+    )
+
+
+def _beside(origin: Int[Array, "R"]) -> Bool[Array, "R R"]:
+    """Which regions are parts of the same one, and not the same."""
+    return (origin[:, None] == origin) & ~jnp.eye(len(origin), dtype=bool)
+
+
+def _model(state: CommanderState) -> Model:
+    assert state.model is not None
+    return state.model

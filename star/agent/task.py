@@ -1,0 +1,43 @@
+"""What all levels know of the task."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from star.abstraction.regions import Box
+from star.agent.sections import AgentConfig, Config
+from star.agent.subgoals import Boxes, Points
+from star.spec import Spec
+
+
+class Task(NamedTuple):
+    """The environment, and what is set in it."""
+
+    spec: Spec
+    subgoals: Points | Boxes
+    """What the Controller is given: points by a Tutor, boxes where there is none."""
+    goal_margin: float | Array
+
+    @classmethod
+    def of(cls, config: AgentConfig | Config, spec: Spec) -> Task:
+        """The task as the levels of `config` see it."""
+        margin = config.commander.goal_margin
+        if config.tutor.enabled:
+            return cls(spec, Points(len(spec.scale)), margin)
+        return cls(spec, Boxes(2 * len(spec.abstract_indices), margin), margin)
+
+    def goal_box(self, point: Float[Array, "*batch d"]) -> Box:
+        """The box that stands for a goal at the abstract `point`."""
+        return Box.around(point, self.goal_margin)
+
+
+def first_cuts(config: AgentConfig | Config, spec: Spec) -> list[list[float]]:
+    """Where the abstract space is cut at first: as the task says, or `abstraction.cuts`, or `abstraction.grid`."""
+    if config.abstraction.grid is None:
+        cuts = spec.region_cuts if config.abstraction.cuts is None else config.abstraction.cuts
+        return [list(positions) for positions in cuts]
+    parts = (*config.abstraction.grid, *[1] * (len(spec.abstract_indices) - len(config.abstraction.grid)))
+    return [np.linspace(low, high, n + 1)[1:-1].tolist() for n, low, high in zip(parts, *spec.space, strict=False)]

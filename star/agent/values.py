@@ -1,0 +1,106 @@
+"""The Commander's table of values over regions, and how a target is chosen by it."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from star.agent.decisions import Decision, Successors
+from star.agent.sections import CommanderConfig
+
+
+class Model(struct.PyTreeNode):
+    """Fading counts of where commands led, and of the rewards on the way."""
+
+    led: Float[Array, "2 R R R"]
+    """Decisions by aim (0: the target region, 1: the goal in it), region, target and next region."""
+    rewards: Float[Array, "R R R"]
+    """Sums of rewards by region, goal region and target, of those that ended an episode too."""
+    visits: Float[Array, "R R R"]
+    """Decisions by region, goal region and target, with those that ended an episode."""
+    lost: Float[Array, "2 R R"]
+    """Decisions by aim, region and target during which the episode was terminated."""
+    reach: Float[Array, "R R R"]
+    """Values like Q for those who practise: discounted chances of being in the pursued region."""
+
+
+class CommanderState(struct.PyTreeNode):
+    """Q over (region, goal region, target region), how often each target was chosen of late, and any `model`."""
+
+    q: Float[Array, "R R R"]
+    chosen: Float[Array, "R"]
+    model: Model | None = None
+
+
+def choose(
+    state: CommanderState,
+    allowed: Successors,
+    region: Int[Array, "B"],
+    goal_region: Int[Array, "B"],
+    *,
+    practised: Int[Array, "B"] | None = None,
+    attraction: Float[Array, "R"] | None = None,
+    worth: Float[Array, "B R"] | None = None,
+    epsilon: Float[Array, "B"] | float,
+    key: Array,
+) -> Int[Array, "B"]:
+    """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random.
+
+    Random ones are drawn evenly, or in proportion to `attraction`. `practised` are regions to pursue instead of the
+    goal where they are not negative. `worth`, from 0 to 1, makes less of the values.
+    """
+    explore_key, random_key, tie_key = jax.random.split(key, 3)
+    values = state.q[region, goal_region]
+    if worth is not None:
+        values -= (1 - worth) * jnp.abs(values)
+    if practised is not None:
+        reach = state.q if state.model is None else state.model.reach
+        values = jnp.where((practised >= 0)[:, None], reach[region, practised], values)
+    pursued = goal_region if practised is None else jnp.where(practised >= 0, practised, goal_region)
+    best_values = jnp.where(_targets(allowed.greedy, region, pursued), values, -jnp.inf)
+    ties = best_values >= best_values.max(axis=-1, keepdims=True)
+    greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best_values.shape), -1.0), axis=-1)
+    luck = jax.random.gumbel(random_key, best_values.shape)
+    if attraction is not None:
+        luck += jnp.log(jnp.maximum(attraction, 1e-6))
+    anything = jnp.where(_targets(allowed.explore, region, pursued), luck, -jnp.inf)
+    exploring = jax.random.uniform(explore_key, region.shape) < epsilon
+    return jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
+
+
+def towards(
+    state: CommanderState, allowed: Successors, goal_region: Int[Array, ""]
+) -> tuple[Float[Array, "R"], Int[Array, "R"]]:
+    """For g* in `goal_region`: the value of every region, and the target that is best there, the first of equals."""
+    possible = _targets(allowed.greedy, jnp.arange(state.chosen.shape[0]), goal_region)
+    values = jnp.where(possible, state.q[:, goal_region], -jnp.inf)
+    return best(state.q, allowed.greedy)[:, goal_region], jnp.argmax(values, axis=-1)
+
+
+def best(q: Float[Array, "R R R"], allowed: Bool[Array, "R R"]) -> Float[Array, "R R"]:
+    """Value of every region and goal region; 0 for regions that are not in use."""
+    own = jnp.arange(q.shape[0])
+    values = jnp.where(allowed[:, None], q, -jnp.inf).max(axis=-1)
+    values = values.at[own, own].max(q[own, own, own])
+    return jnp.where(allowed.any(axis=1)[:, None], values, 0.0)
+
+
+def td_error(
+    section: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision
+) -> Float[Array, "N"]:
+    """R + gamma max Q' - Q; time limits are not seen here, so every period bootstraps."""
+    future = best(state.q, allowed.greedy)[batch.next_region, batch.goal_region]
+    return batch.reward + section.discount * future - state.q[batch.region, batch.goal_region, batch.target]
+
+
+def towards_goals(batch: Decision) -> Float[Array, "N"]:
+    """The weight of the decisions that pursued the goal of the task by way of a region."""
+    return batch.weight * (1 - batch.practised) * (1 - batch.aside)
+
+
+def _targets(allowed: Bool[Array, "R R"], region: Int[Array, "n"], goal_region: Int[Array, "*n"]) -> Bool[Array, "n R"]:
+    """What may follow each `region`, if the goal is in `goal_region`."""
+    home = jax.nn.one_hot(region, allowed.shape[0], dtype=bool)
+    return allowed[region] | (home & (region == goal_region)[:, None])
