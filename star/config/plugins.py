@@ -50,8 +50,10 @@ def find(name: str, kind: type[Kind]) -> Kind:
     except Exception as error:  # whatever its author has done
         raise ConfigError(f"cannot be imported: {type(error).__name__}: {' '.join(str(error).split())}") from None
     if not isinstance(found, kind):
-        there = f"{module} holds no {attribute}" if found is None else f"is a {type(found).__name__}"
-        raise ConfigError(f"{there}; allowed: a {kind.__module__}.{kind.__qualname__}")
+        allowed = f"allowed: a {kind.__module__}.{kind.__qualname__}"
+        if found is None:
+            raise ConfigError(f"{module} holds no {attribute}; {allowed}")
+        raise ConfigError(f"is a {'class' if isinstance(found, type) else type(found).__name__}; {allowed}")
     return found
 
 
