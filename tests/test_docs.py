@@ -1,4 +1,5 @@
 import dataclasses
+import importlib
 import itertools
 import json
 import operator
@@ -91,6 +92,28 @@ def test_every_command_line_of_the_pages_is_accepted(words, folder):
         (folder / run).mkdir(parents=True)
         (folder / run / "config.yaml").write_text(Config().to_yaml())
     assert main(words[1:]) == 0
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_modules_that_a_page_names_are_where_it_says(page):
+    text = PAGES[page]
+    for path in re.findall(r"\b(?:star|envs|scripts|tests)/[\w/*]+\.py\b", text):
+        assert list(ROOT.glob(path)), path
+    for module in re.findall(r"^::: (\S+)$|`((?:star|envs)(?:\.[a-z_]\w*)+)`", text, re.MULTILINE):
+        exists(next(filter(None, module)))
+    for module in re.findall(r"api\.md#([\w.]+)", text):
+        assert f"::: {module}\n" in PAGES["docs/api.md"], module
+
+
+def exists(name):
+    """Find what `name` stands for: a module of ours, or something in one."""
+    parts, found = name.split("."), None
+    for length in range(1, len(parts) + 1):
+        try:
+            found = importlib.import_module(".".join(parts[:length]))
+        except ModuleNotFoundError:
+            return operator.attrgetter(".".join(parts[length - 1 :]))(found)
+    return found
 
 
 SMALL = {  # the Controller alone, for the sake of compilation

@@ -378,11 +378,11 @@ def shared(url, *, workers):
         while not busy:
             running = [trial for trial in ledger.trials() if trial.state.name == "RUNNING"]
             busy = [trial.user_attrs["worker"] for trial in running if "worker" in trial.user_attrs]
-        killed = int(busy[0].rpartition(":")[2])
+        killed = int(busy[-1].rpartition(":")[2])  # the last to begin is the last to end by itself
         os.kill(killed, signal.SIGKILL)
         codes = [int(code) for code in process.communicate(timeout=120)[0].split()]
     assert codes == [-signal.SIGKILL if pid == killed else 0 for pid in pids]
-    return ledger, busy[0]
+    return ledger, busy[-1]
 
 
 def check_shared(ledger, killed):
