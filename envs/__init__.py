@@ -13,6 +13,7 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
+from envs.common.errors import UserError
 from envs.options import EnvError
 from envs.tasks import names
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from envs.maze import MazeEnv
     from envs.vector import VectorEnv
 
-__all__ = ["EnvError", "MazeEnv", "VectorEnv", "make", "names"]
+__all__ = ["EnvError", "MazeEnv", "UserError", "VectorEnv", "make", "names"]
 
 _HOMES = {"make": "envs.build", "MazeEnv": "envs.maze", "VectorEnv": "envs.vector"}
 

@@ -32,7 +32,7 @@ QUALITY = {".jpg": 90, ".html": 75}  # of JPEG and WebP, up to 100
 
 
 def check(path: Path, *, force: bool = False) -> None:
-    """Raise `EnvError` in one line if `write` could not write `path`, or would replace it without `force`."""
+    """Raise `UserError` in one line if `write` could not write `path`, or would replace it without `force`."""
     files.check(path, STILLS + FILMS, force=force)
     if path.suffix.lower() == ".mp4":
         _ffmpeg()
@@ -49,7 +49,7 @@ def write(path: Path, pictures: Iterable[np.ndarray], *, fps: float = 20.0) -> i
     An existing file is replaced. A still takes the first picture and leaves the others undrawn.
 
     Raises:
-      EnvError: in one line, if the file cannot be written.
+      UserError: in one line, if the file cannot be written.
     """
     counted = _Counted(pictures)
     with files.whole(path) as partial:

@@ -7,6 +7,7 @@ from pydantic import ValidationError
 
 from envs.common.errors import UserError
 from star.agent.sections import Config
+from star.config.section import Section
 from star.loading import fields, load, parse
 
 DEFAULTS = {key: default for key, default, _ in fields()}
@@ -110,7 +111,7 @@ def test_a_wrong_type_names_key_value_and_what_is_allowed(write, text, key, valu
         ("commander: {epsilon_end: 1.1}", "commander.epsilon_end: 1.1", "less than or equal to 1"),
         ("abstraction: {max_regions: 5000}", "abstraction.max_regions: 5000", "less than or equal to 1024"),
         ("refinement: {depth: 13}", "refinement.depth: 13", "less than or equal to 12"),
-        ("tutor: {learner: sac}", "tutor.learner: 'sac'", "'ppo' or 'td3'"),
+        ("tutor: {learner: sac}", "tutor.learner: 'sac'", "'ppo', 'td3' or 'module:name'"),
         ("tutor: {enabled: 3}", "tutor.enabled: 3", "should be true or false"),
         ("tutor: {enabled: [1]}", "tutor.enabled: [1]", "should be true or false"),
         ("tutor: {enabled: null}", "tutor.enabled: null", "should be true or false"),
@@ -320,7 +321,8 @@ def test_yaml_holds_every_setting():
 def test_fields_lists_every_setting_with_its_default_and_meaning():
     config = Config()
     for key, default, description in fields():
-        assert lookup(config, key) == default
+        value = lookup(config, key)
+        assert (value.model_dump() if isinstance(value, Section) else value) == default
         assert description
     assert {"env.name", "tutor.ppo.hidden", "trainer.num_seeds"} <= set(DEFAULTS)
 

@@ -6,6 +6,7 @@ import operator
 import re
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import jax
@@ -69,8 +70,10 @@ def folder(tmp_path, monkeypatch):
     """A working directory with the shipped config files and those of the tutorial, where no command really trains."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
-    for name, text in files("docs/tutorial.md").items():
+    for name, text in (files("docs/tutorial.md") | files("docs/howto.md")).items():
         (tmp_path / name).write_text(text)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setenv("STAR_IMPORT", "")
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
     monkeypatch.setattr("star.debugging.turn_on", lambda: None)
     monkeypatch.setattr("star.devices.join", lambda cluster: None)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from envs import EnvError, video
+from envs import EnvError, UserError, video
 
 COLOURS = [(200, 40, 40), (40, 200, 40), (40, 40, 200)]
 
@@ -92,7 +92,7 @@ def test_what_ffmpeg_complains_about_is_told_in_one_line(tmp_path, monkeypatch):
     program.write_text("#!/bin/sh\necho first >&2\necho no such codec >&2\nexit 1\n")
     program.chmod(program.stat().st_mode | stat.S_IEXEC)
     monkeypatch.setattr(shutil, "which", lambda name: str(program))
-    with pytest.raises(EnvError) as error:
+    with pytest.raises(UserError) as error:
         video.write(tmp_path / "film.mp4", [np.zeros((400, 400, 3), np.uint8)] * 3)
     assert str(error.value) == "film.mp4: ffmpeg failed: no such codec"
     assert not (tmp_path / "film.mp4").exists()
@@ -117,7 +117,7 @@ def test_without_ffmpeg_an_mp4_is_refused_and_others_are_not(tmp_path, no_ffmpeg
 def test_what_cannot_be_written_is_refused_in_one_line(tmp_path, name, said):
     (tmp_path / "old.gif").write_text("precious")
     (tmp_path / "folder.gif").mkdir()
-    with pytest.raises(EnvError) as error:
+    with pytest.raises(UserError) as error:
         video.check(tmp_path / name)
     assert said in str(error.value) and "\n" not in str(error.value)
 
@@ -146,5 +146,5 @@ def test_a_full_disk_is_told_in_one_line(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(EnvError, match="film.html: cannot be written: No space left on device$"):
+    with pytest.raises(UserError, match="film.html: cannot be written: No space left on device$"):
         video.write(tmp_path / "film.html", pictures())

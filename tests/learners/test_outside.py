@@ -23,7 +23,8 @@ def here(tmp_path, monkeypatch):
     """An empty folder with the page's mine.py and a small run's config."""
     text = re.search(r'```python title="mine.py"\n(.*?)```', PAGE.read_text(encoding="utf-8"), re.DOTALL).group(1)
     (tmp_path / "mine.py").write_text(text)
-    (tmp_path / "run.yaml").write_text(json.dumps(RUN))
+    alone = {"commander": {"enabled": False}, "tutor": {"enabled": False, "unroll": 3}}  # for the sake of compilation
+    (tmp_path / "run.yaml").write_text(json.dumps(RUN | alone))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delenv("STAR_IMPORT", raising=False)

@@ -7,18 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from star.agent import commander
-from star.agent.commander import CommanderState
+from star.agent import values
+from star.agent.decisions import successors
+from star.agent.values import CommanderState
 
 R, B = 6, 64
 
 
 def _choose(mode, q, reaches, misses, count, epsilon, key):
     active = jnp.arange(R) < count
-    allowed = commander.successors(mode, reaches=reaches, misses=misses, active=active)
+    allowed = successors(mode, reaches=reaches, misses=misses, active=active)
     where, goal = jax.random.randint(key, (2, B), 0, count)
     state = CommanderState(q=q, chosen=jnp.zeros(R))
-    return allowed, where, goal, commander.act(state, allowed, where, goal, epsilon=epsilon, key=key)
+    return allowed, where, goal, values.choose(state, allowed, where, goal, epsilon=epsilon, key=key)
 
 
 choose = jax.jit(_choose, static_argnums=0)
