@@ -57,15 +57,14 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
     fresh = jax.tree.map(
         lambda x: x[:, 0, : min(x.shape[2], program.config.trainer.num_envs * 16)], state.forward_model.ring.experience
     )
-    goals = refinement.Goals.of(fresh, jnp.ones_like(fresh.weight, bool), radius=program.spec.success_radius)
+    goals = refinement.Goals.of(fresh, jnp.ones_like(fresh.weight, bool), cube=program.spec.cube)
     keys = jax.random.split(jax.random.key(0), len(program.seeds))
-    radius = program.spec.success_radius
 
     @jax.jit
     @jax.vmap
     def refine(state: TrainState, goals: refinement.Goals, key: jax.Array) -> Any:
         tables = state.abstraction, state.graph, state.forward_model
-        return refinement.refine(agent, *tables, goals, radius=radius, key=key)
+        return refinement.refine(agent, *tables, goals, cube=program.spec.cube, key=key)
 
     train = jax.jit(jax.vmap(lambda s, f, k: models.train(agent.forward_model, s, f, key=k)))
     return {

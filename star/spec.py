@@ -60,6 +60,11 @@ class Spec:
         )
 
     @property
+    def cube(self) -> float:
+        """Half-width of the cube inside the ball of success around a goal, in units of the state."""
+        return self.success_radius / len(self.goal_indices) ** 0.5
+
+    @property
     def scale(self) -> Float[Array, "p"]:
         """Half-ranges of the Tutor's subgoals."""
         return jnp.asarray(self.subgoal_scale + ((self.heading, self.heading) if self.heading else ()))

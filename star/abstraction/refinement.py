@@ -86,11 +86,11 @@ class Goals(struct.PyTreeNode):
     weight: Float[Array, "N"]
 
     @classmethod
-    def of(cls, outcome: Outcome, at_goal: Bool[Array, "*N"], *, radius: float) -> Goals:
-        """The outcomes commanded `at_goal`; goals count as reached within the square inside the circle of success."""
+    def of(cls, outcome: Outcome, at_goal: Bool[Array, "*N"], *, cube: float) -> Goals:
+        """The outcomes commanded `at_goal`; goals count as reached within so many units of each coordinate."""
         away = jnp.maximum(outcome.lower - outcome.end, outcome.end - outcome.upper)
         half = (outcome.upper - outcome.lower) / 2
-        reached = jnp.all(away <= _widening(half, radius), axis=-1)
+        reached = jnp.all(away <= _widening(half, cube), axis=-1)
         return cls(lower=outcome.lower, upper=outcome.upper, reached=reached, weight=outcome.weight * at_goal)
 
 
@@ -224,15 +224,15 @@ def refine(
     model: ForwardModelState,
     goals: Goals,
     *,
-    radius: float | Array,
+    cube: float | Array,
     weight: Float[Array, "R"] | float = 1.0,
     key: Array,
 ) -> tuple[Graph, Change, Metrics]:
     """Examine the due pairs of one epoch, at most `pairs_per_epoch`, and cut where a verdict is mixed.
 
-    `radius` is that of success around goals. Of the due pairs, those commanded most and waiting longest come first;
-    `weight` multiplies the urgency of those that lead to each region. Returns the graph of the new regions, and the
-    change that tables indexed by region have to follow, with [pairs_per_epoch * cuts_per_pair] splits.
+    `cube` is `Spec.cube`. Of the due pairs, those commanded most and waiting longest come first; `weight` multiplies the
+    urgency of those that lead to each region. Returns the graph of the new regions, and the change that tables indexed
+    by region have to follow, with [pairs_per_epoch * cuts_per_pair] splits.
     """
     graph, before = forget(config, graph), abstraction
     starts, seen = forward_model.visited(model)
@@ -242,7 +242,7 @@ def refine(
         region, target, found = _most_urgent(config, abstraction, graph, weight)
         inside = region == target
         goal_key, cut_key = jax.random.split(pair_key)
-        commanded, wanted, there = _boxes(abstraction, region, target, goals, radius=radius, key=goal_key)
+        commanded, wanted, there = _boxes(abstraction, region, target, goals, cube=cube, key=goal_key)
         judged = found & there
         leaves = _examine(config, abstraction, model, region, commanded, wanted, starts, seen)
         verdict = reachability.summary(leaves)
@@ -305,13 +305,13 @@ def on_split(graph: Graph, split: Split) -> Graph:
     return where(split.done, parts, graph)
 
 
-def _widening(half: Float[Array, "*n d"], radius: float | Array) -> Float[Array, "*n d"]:
-    """What a box of half-widths `half` lacks to the cube inside a ball of that radius."""
-    return jnp.maximum(radius / half.shape[-1] ** 0.5 - half, 0.0)
+def _widening(half: Float[Array, "*n d"], cube: float | Array) -> Float[Array, "*n d"]:
+    """What a box of half-widths `half` lacks to a cube of half-width `cube`."""
+    return jnp.maximum(cube - half, 0.0)
 
 
 def _boxes(
-    abstraction: Abstraction, region: Array, target: Array, goals: Goals, *, radius: float | Array, key: Array
+    abstraction: Abstraction, region: Array, target: Array, goals: Goals, *, cube: float | Array, key: Array
 ) -> tuple[tuple[Array, Array], tuple[Array, Array], Bool[Array, ""]]:
     """The box that is commanded to examine a pair, the box that is to be reached, and whether there is one.
 
@@ -323,7 +323,7 @@ def _boxes(
         jnp.where(inside, goal[0], abstraction.lower[target]),
         jnp.where(inside, goal[1], abstraction.upper[target]),
     )
-    widened = _widening((goal[1] - goal[0]) / 2, radius) * inside
+    widened = _widening((goal[1] - goal[0]) / 2, cube) * inside
     return commanded, (commanded[0] - widened, commanded[1] + widened), ~inside | there
 
 

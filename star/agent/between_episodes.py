@@ -53,7 +53,7 @@ def learn(
     }
     periods = num_envs * (spec.episode_length // section.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
-    goals = Goals.of(outcome, decision.at_goal, radius=spec.success_radius)
+    goals = Goals.of(outcome, decision.at_goal, cube=spec.cube)
     state, more = _learn_where_commands_lead(config, state, decision, outcome, key=train_key)
     metrics |= more
     if config.refinement.enabled:
@@ -91,7 +91,7 @@ def refine(
         state.graph,
         state.forward_model,
         goals,
-        radius=spec.success_radius,
+        cube=spec.cube,
         weight=guide.urgency(config.sgim, state.sgim),
         key=key,
     )

@@ -178,6 +178,7 @@ def experience(
     """The memory after a segment, and the periods that came to their end with it; weight 0 elsewhere."""
     worthy = worth(section, segment.distance, segment.success)
     steps = len(segment.alive)
+    last = jnp.sum(worthy * segment.terminated * segment.alive, axis=0)
     memory = memory.replace(
         reward=accumulate(section, memory.reward, worthy, segment.alive), clock=(memory.clock + steps) % section.period
     )
@@ -191,7 +192,7 @@ def experience(
         region=memory.region,
         goal_region=memory.goal_region,
         target=memory.target,
-        reward=memory.reward,
+        reward=where(segment.lost > 0, lost_reward(section, memory.reward, last), memory.reward),
         next_region=regions.locate(roadmap.abstraction, end),
         weight=weight,
         lost=lost,
@@ -268,8 +269,8 @@ def plan(section: CommanderConfig, state: CommanderState, roadmap: Roadmap) -> C
 
 
 def measure(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, batch: Decision) -> Metrics:
-    """Mean reward of the decisions in `batch` and their mean absolute error of temporal difference."""
-    weight = values.towards_goals(batch)
+    """Mean reward of the whole periods in `batch` and their mean absolute error of temporal difference."""
+    weight = batch.weight * values.towards_goals(batch)
     error = values.td_error(section, state, roadmap.allowed, batch)
     return {"reward": weighted_mean(batch.reward, weight), "td_error": weighted_mean(jnp.abs(error), weight)}
 
@@ -280,6 +281,14 @@ def worth(section: CommanderConfig, distance: Float[Array, "*n"], success: Float
     Distances deceive in a maze, and where they pay, so does waiting at the near side of a wall.
     """
     return success if section.reward == "success" else -distance
+
+
+def lost_reward(section: CommanderConfig, reward: Float[Array, "B"], last: Float[Array, "B"]) -> Float[Array, "B"]:
+    """Of a period in which the task was terminated, with nothing to follow; `last` is the worth of its last env step.
+
+    Success so far counts. Distances are paid for ever, last / (1 - gamma), or else it would be best to end early.
+    """
+    return reward if section.reward == "success" else last / (1.0 - section.discount)
 
 
 def start_reward(section: CommanderConfig) -> float:

@@ -1,6 +1,7 @@
 """Tabular Q-learning over regions, the Commander's published learner.
 
     Q[i, g, j] <- Q + alpha_n (r + gamma max_j' Q[i', g, j'] - Q)           r = max over the period of -||g* - s||
+                              (r - Q where the task was terminated          r = -||g* - s|| / (1 - gamma) then)
 
 The B environments are B streams of one table: the errors of a cell are averaged over the n decisions of a batch that
 visited it, and alpha_n = 1 - (1 - alpha)^n is the step that n updates in a row towards that average would make.
@@ -34,7 +35,7 @@ def observe(
 ) -> CommanderState:
     """A step on what the streams decided at one instant; what a teacher chose rises to `margin` above all else."""
     error = td_error(section, state, roadmap.allowed, batch)
-    state = _step(section, state, batch, error, weight=towards_goals(batch))
+    state = _step(section, state, batch, error, weight=jnp.maximum(batch.weight, batch.lost) * towards_goals(batch))
     return state if batch.shown is None else _follow_teacher(section, state, batch, batch.shown, margin)
 
 

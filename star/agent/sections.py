@@ -58,7 +58,10 @@ class CommanderConfig(Section):
     prior: float = Field(5.0, gt=0, description="decisions that weigh as much as the belief in what was not tried")
     memory: float = Field(0.5, ge=0, le=1, description="share of a decision's weight in the model left an epoch later")
     goal_margin: float = Field(
-        1.0, gt=0, description="half-width of the box around g* given to the Tutor in its region"
+        1.0,
+        gt=0,
+        description="largest half-width of the box around g* given to the Tutor in its region, which is never more "
+        "than fits into the ball of success",
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -20,11 +21,12 @@ class Task(NamedTuple):
     subgoals: Points | Boxes
     """What the Controller is given: points by a Tutor, boxes where there is none."""
     goal_margin: float | Array
+    """Half-width of the box around a goal, all of which counts as reached."""
 
     @classmethod
     def of(cls, config: AgentConfig | Config, spec: Spec) -> Task:
         """The task as the levels of `config` see it."""
-        margin = config.commander.goal_margin
+        margin = jnp.minimum(config.commander.goal_margin, spec.cube)
         if config.tutor.enabled:
             return cls(spec, Points(len(spec.scale)), margin)
         return cls(spec, Boxes(2 * len(spec.abstract_indices), margin), margin)

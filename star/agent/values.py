@@ -90,14 +90,14 @@ def best(q: Float[Array, "R R R"], allowed: Bool[Array, "R R"]) -> Float[Array, 
 def td_error(
     section: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision
 ) -> Float[Array, "N"]:
-    """R + gamma max Q' - Q; time limits are not seen here, so every period bootstraps."""
-    future = best(state.q, allowed.greedy)[batch.next_region, batch.goal_region]
+    """R + gamma max Q' - Q, and R - Q where the task was terminated; time limits are not seen here."""
+    future = (1 - batch.lost) * best(state.q, allowed.greedy)[batch.next_region, batch.goal_region]
     return batch.reward + section.discount * future - state.q[batch.region, batch.goal_region, batch.target]
 
 
 def towards_goals(batch: Decision) -> Float[Array, "N"]:
-    """The weight of the decisions that pursued the goal of the task by way of a region."""
-    return batch.weight * (1 - batch.practised) * (1 - batch.aside)
+    """1 for the decisions that pursued the goal of the task by way of a region."""
+    return (1 - batch.practised) * (1 - batch.aside)
 
 
 def _targets(allowed: Bool[Array, "R R"], region: Int[Array, "n"], goal_region: Int[Array, "*n"]) -> Bool[Array, "n R"]:

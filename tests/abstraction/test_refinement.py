@@ -81,7 +81,9 @@ def refine():
     jitted = jax.jit(refinement.refine)
 
     def call(chosen, abstraction, graph, model, goals=NO_GOALS):
-        graph, change, metrics = jitted(chosen, abstraction, graph, model, goals, radius=3.0, key=jax.random.key(0))
+        graph, change, metrics = jitted(
+            chosen, abstraction, graph, model, goals, cube=3.0 / 2**0.5, key=jax.random.key(0)
+        )
         jax.tree.map(np.testing.assert_array_equal, change.before, abstraction)
         return change.after, graph, change.splits, metrics
 
@@ -429,7 +431,7 @@ def test_goals_come_from_decisions_at_the_goal_and_count_as_reached_within_the_c
     box = jnp.array([[5.0, 5.0]] * 4)
     end = jnp.array([[5.0, 7.0], [5.0, 7.2], [6.9, 3.1], [5.0, 5.0]])
     outcome = Outcome(start=box, lower=box - 1, upper=box + 1, end=end, weight=jnp.array([1.0, 1.0, 1.0, 0.0]))
-    goals = Goals.of(outcome, jnp.array([True, True, False, True]), radius=3.0)  # 3 / sqrt(2) = 2.12
+    goals = Goals.of(outcome, jnp.array([True, True, False, True]), cube=3.0 / 2**0.5)
     assert goals.reached.tolist() == [True, False, True, True]
     assert goals.weight.tolist() == [1, 1, 0, 0]
 
@@ -440,7 +442,7 @@ def test_random_cuts_come_at_the_same_time_but_anywhere(refine, moving):
     positions = set()
     for seed in range(8):
         _, change, metrics = jitted(
-            chosen, grid(), knowing((0, 2)), moving((6, 0)), NO_GOALS, radius=3.0, key=jax.random.key(seed)
+            chosen, grid(), knowing((0, 2)), moving((6, 0)), NO_GOALS, cube=3.0 / 2**0.5, key=jax.random.key(seed)
         )
         assert int(metrics["mixed"]) == int(metrics["splits"]) == 1 and int(change.splits.parent[0]) == 0
         positions.add(tuple(np.asarray(change.after.lower[4]).tolist()))

@@ -65,14 +65,14 @@ def slow_update(q, allowed, batch, *, alpha, discount):
         errors = []
         for n in range(N):
             if (
-                batch.weight[n]
+                max(batch.weight[n], batch.lost[n])
                 and not batch.practised[n]
                 and not batch.aside[n]
                 and (batch.region[n], batch.goal_region[n], batch.target[n]) == (i, g, j)
             ):
                 after = batch.next_region[n]
                 best = max(q[after, g, k] for k in range(R) if allowed[after, k])
-                errors.append(batch.reward[n] + discount * best - q[i, g, j])
+                errors.append(batch.reward[n] + (0 if batch.lost[n] else discount * best) - q[i, g, j])
         if errors:
             new[i, g, j] += (1 - (1 - alpha) ** len(errors)) * np.mean(errors)
     return new
@@ -98,6 +98,28 @@ def test_q_learning_averages_the_errors_of_each_cell(observe, seed):
     expected = slow_update(q, np.asarray(allowed.greedy), batch, alpha=0.1, discount=0.9)
     assert (expected != q).sum() > 10
     np.testing.assert_allclose(after.q, expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("learner", ["q", "model"])
+def test_who_loses_the_task_at_a_distance_does_no_better_than_who_waits_there(observe, learner):
+    """Whatever the learner: an end must not look like a way out of rewards that are negative."""
+    chosen = settings(learner=learner, reward="mean", discount=0.9, learning_rate=1.0, prior=1e-3, sweeps=200)
+    empty = commander.init(chosen, regions=R)
+    everything = jnp.ones((R, R), bool)
+    allowed = Successors(everything, everything)
+
+    def value(batch):
+        state = empty
+        for _ in range(200):
+            state = observe(chosen, state, allowed, batch)
+        return float(commander.plan(chosen, state, known(allowed)).q[1, 4, 2])
+
+    distance = jnp.full(1, 7.0)
+    end = commander.lost_reward(chosen, jnp.zeros(1), commander.worth(chosen, distance, jnp.zeros(1)))
+    loses = value(many(1, 2, 0, count=8, lost=1.0, reward=float(end[0])).replace(weight=np.zeros(8, np.float32)))
+    assert loses == pytest.approx(-70.0, rel=1e-2)
+    assert settings().reward == "success"
+    np.testing.assert_array_equal(commander.lost_reward(settings(), jnp.full(1, 0.3), jnp.ones(1)), np.float32([0.3]))
 
 
 def test_the_measured_reward_is_that_of_whole_periods_with_the_goal_of_the_task():

@@ -48,6 +48,10 @@ def test_a_period_is_lost_where_the_task_was_terminated_and_not_where_it_was_tru
     for i, b in segments(recording):
         expected = (recording.steps.terminated[i, :, b] * recording.steps.alive[i, :, b]).any()
         assert recording.decision.lost[i, b] == expected
+        if expected:  # the distance at its end is paid for ever
+            last = int(recording.steps.alive[i, :, b].sum()) - 1
+            worth = -recording.steps.distance[i, last, b] / (1 - recording.config.commander.discount)
+            np.testing.assert_allclose(recording.decision.reward[i, b], worth, rtol=1e-5)
         lost += expected
     assert 0 < lost < sum(ended(recording, i, b) for i, b in segments(recording))
 
@@ -278,7 +282,7 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
             state.graph,
             state.forward_model,
             goals,
-            radius=spec.success_radius,
+            cube=spec.cube,
             key=jax.random.key(0),
         )
 

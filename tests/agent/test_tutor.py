@@ -43,6 +43,27 @@ def test_it_sees_the_state_and_the_bounds_of_the_box(relative):
     np.testing.assert_array_equal(box.centre, [[6, 7]])
 
 
+@pytest.mark.parametrize("radius", [0.1, 0.5, 1.0, 5.0, 40.0])
+@pytest.mark.parametrize("indices", [(0,), (0, 1), (0, 1, 2)])
+def test_whoever_is_in_the_box_around_a_goal_has_reached_it(radius, indices):
+    spec = Spec(
+        state_dim=4,
+        action_size=1,
+        episode_length=1,
+        abstract_indices=indices,
+        goal_indices=indices,
+        subgoal_scale=(1.0,) * len(indices),
+        space=((0.0,) * len(indices), (9.0,) * len(indices)),
+        region_cuts=((),) * len(indices),
+        success_radius=radius,
+    )
+    goal = np.full((1, len(indices)), 3.0)
+    box = Task.of(loading.parse({}), spec).goal_box(goal)
+    corner = np.linalg.norm(box.upper - goal)
+    assert corner <= radius * (1 + 1e-6)
+    assert (box.upper - goal).max() == pytest.approx(min(1.0, radius / len(indices) ** 0.5), rel=1e-5)
+
+
 def test_subgoals_are_clipped_to_their_scale():
     actions = jnp.array([[0.5, -0.5], [3.0, -3.0]])
     np.testing.assert_allclose(tutor.subgoal(actions, jnp.asarray(SCALE)), [[5, -2.5], [10, -5]])
