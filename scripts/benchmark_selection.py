@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from star import sgim
-from star.evaluation import bootstrap
+from star.evaluation import over_seeds
 from star.sgim import beds, selectors
 from star.sgim.beds import Bed
 from star.sgim.selectors import Selector
@@ -155,8 +155,8 @@ def table(found: list[dict[str, Any]]) -> str:
 
 
 def interval(auc: Sequence[float]) -> str:
-    """Mean over seeds and its interval."""
-    return "{:.3f} [{:.3f}, {:.3f}]".format(*bootstrap(auc, np.mean))
+    """Mean over seeds and its interval (Student's t)."""
+    return "{:.3f} [{:.3f}, {:.3f}]".format(*over_seeds(np.asarray(auc)))
 
 
 def draw(found: list[dict[str, Any]], blocks: int, path: Path) -> None:

@@ -14,7 +14,7 @@ are meant to be taken. Into results/TASK, or results/TASK/one_by_one, go
     curves.jsonl  all evaluations during training
     curves.png    success_any over env steps and over wall-clock: mean over seeds, and their range if there are at most
                   five agents; where teachers may be asked also the share of episodes in which they are
-    table.md      means over seeds and interquartile means with 95 % bootstrap intervals
+    table.md      means over seeds with 95 % intervals, how many seeds have learnt the task, and each seed
 
 Seeds that a JSON already holds are not trained again. Runs are kept under `--runs`, those with other SETTINGS apart.
 One that was interrupted goes on, so empty that folder when code or configs have changed.
@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from star.evaluation import bootstrap, interquartile_mean
+from star.evaluation import MEASURES, above, over_seeds
 from star.metrics import Journal, JsonLines
 
 ROOT = Path(__file__).parents[1]
@@ -125,19 +125,21 @@ def table(reports: list[dict[str, Any]]) -> str:
     """A Markdown table of the agents."""
     level = reports[0].get("level", LEVEL)
     lines = [
-        "| agent | seeds | env steps per seed | success_any | success_final | interquartile mean of success_final "
-        f"| median env steps to success_any {level:g} | seconds of training to it | seconds since the start |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| agent | seeds | env steps per seed | success_any | success_final | success_any above .9 "
+        f"| success_any of each seed | median env steps to success_any {level:g} | seconds of training to it "
+        "| seconds since the start |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for report in reports:
         seeds = report["seeds"]
         cells = [report["name"], str(len(seeds)), _steps(report["env_steps_per_seed"])]
-        for key, statistic in (
-            ("success_any", np.mean),
-            ("success_final", np.mean),
-            ("success_final", interquartile_mean),
-        ):
-            cells.append("{:.2f} [{:.2f}, {:.2f}]".format(*bootstrap([seed[key] for seed in seeds], statistic)))
+        for key in MEASURES:
+            scores = np.asarray([seed[key] for seed in seeds])
+            mean, low, high = over_seeds(scores, episodes=seeds[0]["episodes"])
+            cells.append(f"{mean:.3f} [{low:.3f}, {high:.3f}]" if len(seeds) > 1 else f"{mean:.3f}")
+        learnt = above([seed["success_any"] for seed in seeds])
+        cells.append("{} of {} [{:.2f}, {:.2f}]".format(learnt["seeds"], learnt["of"], *learnt["interval"]))
+        cells.append(" ".join(f"{seed['success_any']:.3g}" for seed in seeds))
         for key, form in (
             ("env_steps_to_level", _steps),
             ("training_seconds_to_level", "{:.0f} s".format),

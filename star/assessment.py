@@ -290,8 +290,12 @@ def _row(entry: _Entry, exam: Exam, trials: Trials, shortest: np.ndarray | None)
     row |= summary(trials, shortest)
     if len(per_seed) > 1:
         for measure in MEASURES:
-            _, low, high = evaluation.bootstrap([seed[measure] for seed in per_seed], np.mean)
-            row[f"{measure}_seeds_interval"] = [low, high]
+            scores = [seed[measure] for seed in per_seed]
+            _, low, high = evaluation.over_seeds(np.asarray(scores), episodes=per_seed[0]["episodes"])
+            row |= {
+                f"{measure}_seeds_interval": [float(low), float(high)],
+                f"{measure}_above": evaluation.above(scores),
+            }
     if course.cells is not None:
         row |= {"per_goal": per_goal(course.cells, trials), "walls": course.env.arena.walls().tolist()}
     return row | {"seeds": per_seed}
@@ -311,45 +315,55 @@ def per_goal(cells: np.ndarray, trials: Trials) -> list[dict[str, Any]]:
 
 
 def compare(rows: Sequence[Mapping[str, Any]], groups: Mapping[str, Sequence[Path]]) -> dict[str, Any]:
-    """Interquartile means, performance profiles and probabilities of improvement of groups of runs.
+    """Means, interquartile means, performance profiles and differences of groups of runs.
 
     A run counts with the last of its checkpoints in `rows`, a score is the success of one seed, and runs are compared
-    on one task, which is an environment with its options. A group has intervals if it has several seeds of a task.
+    on one task, which is an environment with its options. Where there are too few seeds for an interval it is None.
     """
     last: dict[str, Mapping[str, Any]] = {}
     for row in sorted(rows, key=lambda row: row["env_steps"]):
         last[row["run"]] = row
     found: dict[str, Any] = {"groups": [], "improvement": []}
     scores: dict[str, dict[str, dict[str, list[float]]]] = {}
-    several: dict[str, bool] = {}  # one seed tells nothing of how seeds differ
+    episodes = min((seed["episodes"] for row in last.values() for seed in row["seeds"]), default=None)
     for name, runs in groups.items():
         scores[name] = {measure: _scores([last[str(run)] for run in runs], measure) for measure in MEASURES}
         entry: dict[str, Any] = {"name": name, "runs": [str(run) for run in runs]}
-        several[name] = any(len(values) > 1 for values in scores[name][MEASURES[0]].values())
         for measure, tasks in scores[name].items():
-            middle, low, high = evaluation.pooled(tasks, evaluation.interquartile_mean)
-            share, below, above = evaluation.pooled(tasks, evaluation.profile)
+            every = np.concatenate(list(tasks.values()))
+            mean, *interval = evaluation.over_tasks(tasks, episodes=episodes)
+            middle, *around = evaluation.pooled(tasks, evaluation.interquartile_mean)
+            share, below, above = evaluation.profile(every)
             entry[measure] = {
                 "scores": tasks,
+                "mean": mean,
+                "mean_interval": _known(interval),
                 "interquartile_mean": float(middle),
-                "interquartile_mean_interval": [float(low), float(high)] if several[name] else None,
+                "interquartile_mean_interval": _known(around),
+                "above": evaluation.above(every),
                 "profile": np.round(share, 4).tolist(),
-                "profile_interval": np.round([below, above], 4).tolist() if several[name] else None,
+                "profile_interval": np.round([below, above], 4).tolist(),
             }
         found["groups"].append(entry)
     for better in groups:
         for than in groups:
             if better != than:
                 pair: dict[str, Any] = {"better": better, "than": than}
-                known = several[better] and several[than]
                 for measure in MEASURES:
-                    chance = evaluation.improvement(scores[better][measure], scores[than][measure])
+                    one, other = scores[better][measure], scores[than][measure]
+                    apart = evaluation.difference(one, other, episodes=episodes)
                     pair |= {
-                        measure: chance and chance[0],
-                        f"{measure}_interval": [*chance[1:]] if chance and known else None,
+                        measure: evaluation.improvement(one, other),
+                        f"{measure}_difference": apart and apart[0],
+                        f"{measure}_difference_interval": apart and _known(apart[1:]),
                     }
                 found["improvement"].append(pair)
     return found
+
+
+def _known(interval: Sequence[float]) -> list[float] | None:
+    """`interval`, or None where it is NaN: one seed tells nothing of how seeds differ."""
+    return None if np.isnan(interval).any() else [float(end) for end in interval]
 
 
 def _scores(rows: Sequence[Mapping[str, Any]], measure: str) -> dict[str, list[float]]:

@@ -18,6 +18,8 @@ from star.agent.play import Episode
 
 MEASURES = ("success_any", "success_final")
 TAUS = np.linspace(0.0, 1.0, 101)  # where performance profiles are taken
+ABOVE = 0.9  # seeds that succeed more often than this have learnt the task
+MANY = 20  # scores from which on drawing them anew tells how they differ
 
 Scores = Mapping[str, Sequence[float]]  # of a group of runs: for each task the score of every seed of every run
 
@@ -104,18 +106,82 @@ def proportion_interval(successes: int, trials: int) -> list[float]:
     return [float(interval.low), float(interval.high)]
 
 
-def mean_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(mean, low, high), each [T], of the rows of `values` [n, T], with 95 % percentile bootstrap intervals over rows.
+def over_seeds(scores: np.ndarray, *, episodes: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(mean, low, high), each [...], of the scores [n, ...] of n seeds, with Student's t intervals.
 
-    A single row is its own interval; where a value is NaN, so are all three.
+    Where scores are shares of so many `episodes`, the interval lies in [0, 1], and is no narrower than chance in the
+    episodes alone makes it: it has a width where all seeds agree. With one seed `low` and `high` are NaN.
     """
-    n = len(values)
-    mean = values.mean(axis=0)
+    mean, n = scores.mean(axis=0), len(scores)
     if n < 2:
-        return mean, mean, mean
-    weights = np.random.default_rng(0).multinomial(n, np.full(n, 1 / n), size=4999) / n
-    low, high = np.quantile(weights @ values, (0.025, 0.975), axis=0)
-    return mean, low, high
+        return mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)
+    low, high = _student(mean, [(_variance(scores, episodes), n - 1)])
+    return (mean, low, high) if episodes is None else (mean, np.clip(low, 0, 1), np.clip(high, 0, 1))
+
+
+def over_tasks(scores: Scores, *, episodes: int | None = None) -> tuple[float, float, float]:
+    """(mean, low, high) of the scores of all tasks together, with the interval of `over_seeds` for strata.
+
+    A task with one seed tells nothing of how seeds differ: then `low` and `high` are NaN.
+    """
+    samples = [np.asarray(sample, float) for sample in scores.values()]
+    total = sum(map(len, samples))
+    mean = float(np.concatenate(samples).mean())
+    if min(map(len, samples)) < 2:
+        return mean, np.nan, np.nan
+    terms = [((len(x) / total) ** 2 * _variance(x, episodes), len(x) - 1) for x in samples]
+    low, high = _student(mean, terms)
+    return (mean, low, high) if episodes is None else (mean, max(float(low), 0.0), min(float(high), 1.0))
+
+
+def difference(better: Scores, than: Scores, *, episodes: int | None = None) -> tuple[float, float, float] | None:
+    """(difference, low, high) of the means of two groups, averaged over the tasks that both have: Welch's interval.
+
+    None if they have no task in common; NaN for `low` and `high` where either has only one seed of one.
+    """
+    common = [task for task in better if task in than]
+    if not common:
+        return None
+    pairs = [(np.asarray(better[task], float), np.asarray(than[task], float)) for task in common]
+    mean = float(np.mean([x.mean() - y.mean() for x, y in pairs]))
+    samples = [x for pair in pairs for x in pair]
+    if min(map(len, samples)) < 2:
+        return mean, np.nan, np.nan
+    low, high = _student(mean, [(_variance(x, episodes) / len(common) ** 2, len(x) - 1) for x in samples])
+    return mean, float(low), float(high)
+
+
+def _variance(scores: np.ndarray, episodes: int | None) -> np.ndarray:
+    """Variance of the mean of `scores` [n, ...], no less than that of as many binomial episodes (Agresti-Coull)."""
+    n = len(scores)
+    spread = scores.var(axis=0, ddof=1) / n
+    if episodes is None:
+        return spread
+    share = (scores.mean(axis=0) * n * episodes + 2) / (n * episodes + 4)
+    return np.maximum(spread, share * (1 - share) / (n * episodes))
+
+
+def _student(middle: Any, terms: Sequence[tuple[Any, int]]) -> tuple[Any, Any]:
+    """Student's t interval at 95 % from the variances of independent terms and their degrees of freedom.
+
+    The degrees of freedom of the sum are those of Welch and Satterthwaite.
+    """
+    variance = sum(term for term, _ in terms)
+    freedom = variance**2 / np.maximum(sum(term**2 / df for term, df in terms), np.finfo(float).tiny)
+    half = stats.t.ppf(0.975, np.maximum(freedom, 1.0)) * np.sqrt(variance)
+    return middle - half, middle + half
+
+
+def exact_interval(successes: int, trials: int) -> list[float]:
+    """Clopper-Pearson interval of a proportion at 95 %: right also for the few seeds of a table."""
+    interval = stats.binomtest(int(successes), trials).proportion_ci(0.95, method="exact")
+    return [float(interval.low), float(interval.high)]
+
+
+def above(scores: Sequence[float] | np.ndarray) -> dict[str, Any]:
+    """How many `seeds` score above `ABOVE`, of how many (`of`), with the `interval` of that share (Clopper-Pearson)."""
+    count = int((np.asarray(scores) > ABOVE).sum())
+    return {"seeds": count, "of": len(scores), "interval": exact_interval(count, len(scores))}
 
 
 def mean_interval(values: np.ndarray) -> list[float]:
@@ -131,12 +197,6 @@ def interquartile_mean(values: np.ndarray) -> float:
     """Mean of the middle half: a quarter of the values, rounded down, is left out at either end."""
     cut = len(values) // 4
     return float(np.sort(values)[cut : len(values) - cut].mean())
-
-
-def bootstrap(values: Sequence[float], statistic: Callable[..., Any]) -> tuple[float, float, float]:
-    """The statistic of `values` with its 95 % percentile bootstrap interval; a single value is its own interval."""
-    middle, low, high = stratified([values], statistic)
-    return float(middle), float(low), float(high)
 
 
 def stratified(samples: Sequence[Sequence[float]], statistic: Callable[..., Any]) -> tuple[Any, Any, Any]:
@@ -162,29 +222,36 @@ def stratified(samples: Sequence[Sequence[float]], statistic: Callable[..., Any]
 
 
 def pooled(scores: Scores, statistic: Callable[[np.ndarray], Any]) -> tuple[Any, Any, Any]:
-    """A statistic of the scores of all tasks together, with its interval from draws within each task."""
-    return stratified(list(scores.values()), lambda *tasks: statistic(np.concatenate(tasks)))
+    """A statistic of the scores of all tasks together, with its interval from draws within each task.
+
+    With fewer scores than `MANY`, `low` and `high` are NaN: draws from a few seeds show too little of how seeds differ.
+    """
+    samples = list(scores.values())
+    if sum(map(len, samples)) < MANY:
+        return statistic(np.concatenate(samples)), np.nan, np.nan
+    return stratified(samples, lambda *tasks: statistic(np.concatenate(tasks)))
 
 
-def profile(values: np.ndarray) -> np.ndarray:
-    """The share of `values` above each of `TAUS`: a performance profile (Agarwal et al. 2021)."""
-    return (values[:, None] > TAUS).mean(axis=0)
+def profile(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(share, low, high), each [101]: the share of `values` above each of `TAUS`, with Clopper-Pearson intervals.
+
+    A performance profile (Agarwal et al. 2021).
+    """
+    counts = (values[:, None] > TAUS).sum(axis=0)
+    low, high = np.transpose([exact_interval(count, len(values)) for count in counts])
+    return counts / len(values), low, high
 
 
-def improvement(better: Scores, than: Scores) -> tuple[float, float, float] | None:
+def improvement(better: Scores, than: Scores) -> float | None:
     """How likely a run of one group scores higher than one of another on a task that both have; ties count half.
 
-    With its interval from draws within each task and group; None if they have no task in common.
+    None if they have no task in common.
     """
     common = [task for task in better if task in than]
     if not common:
         return None
-
-    def probability(*samples: np.ndarray) -> float:
-        pairs = zip(samples[: len(common)], samples[len(common) :], strict=True)
-        return float(np.mean([(np.sign(x[:, None] - y).mean() + 1) / 2 for x, y in pairs]))
-
-    return stratified([group[task] for group in (better, than) for task in common], probability)
+    pairs = [(np.asarray(better[task], float), np.asarray(than[task], float)) for task in common]
+    return float(np.mean([(np.sign(x[:, None] - y).mean() + 1) / 2 for x, y in pairs]))
 
 
 def add_to(table: list[dict[str, Any]], episodes: Episode, *, where: np.ndarray | None = None) -> None:

@@ -72,7 +72,7 @@ def _shown(run: Run, *, most: int) -> dict[str, Any]:
         "task": run.config.env.name,
         "seeds": run.seeds,
         "facts": facts(run),
-        "evaluations": evaluation_curves(run.evaluations),
+        "evaluations": evaluation_curves(run.evaluations, episodes=run.config.trainer.eval_episodes),
         "epochs": epoch_curves(run.epochs),
         "map": growth(run, most=most) if run.regions else None,
         "film": film(run.paths[0]),
@@ -85,7 +85,7 @@ def facts(run: Run) -> dict[str, Any]:
 
     The shares of success are [mean, low, high] over seeds in the last evaluation, or None before the first.
     """
-    last = run.epochs[-1][0]
+    last, episodes = run.epochs[-1][0], run.config.trainer.eval_episodes
     regions = _table(run.epochs[-1:], "abstraction/regions")
     best = {name: _table(run.evaluations[-1:], f"eval/{name}") for name in ("success_any", "success_final")}
     return {
@@ -100,18 +100,20 @@ def facts(run: Run) -> dict[str, Any]:
         "command": " && ".join(run.again),
         "starts": run.starts,
         "changes": history.changes(run),
-    } | {name: _short(np.ravel(evaluation.mean_band(table))) or None for name, table in best.items()}
+    } | {name: _seeds(table, episodes) or None for name, table in best.items()}
 
 
-def evaluation_curves(epochs: Sequence[Sequence[Row]]) -> dict[str, Any]:
+def evaluation_curves(epochs: Sequence[Sequence[Row]], *, episodes: int) -> dict[str, Any]:
     """What was measured on test goals, as curves over `env_steps` and `wall_s`, thinned to `MAX_POINTS`.
 
-    Each has the `mean` over seeds, `low` and `high` (95 % bootstrap interval of that mean), and the `seeds` themselves.
+    Each has the `mean` over seeds, `low` and `high` (95 % interval of that mean, None of one seed), and the `seeds`
+    themselves. Shares are those of so many greedy `episodes` of each seed.
     """
     found: dict[str, Any] = _clocks(epochs)
     for key in _numbers(epochs, "eval/"):
         table = _thin(_table(epochs, key))
-        mean, low, high = map(_short, evaluation.mean_band(table))
+        shares = episodes if key.startswith("eval/success") else None
+        mean, low, high = map(_short, evaluation.over_seeds(table, episodes=shares))
         found[key] = {"mean": mean, "low": low, "high": high, "seeds": [_short(row) for row in table]}
     return found
 
@@ -147,6 +149,11 @@ def _thin(table: np.ndarray) -> np.ndarray:
     if table.shape[1] <= MAX_POINTS:
         return table
     return np.stack([part.mean(axis=1) for part in np.array_split(table, MAX_POINTS, axis=1)], axis=1)
+
+
+def _seeds(table: np.ndarray, episodes: int) -> list[float | None]:
+    """[mean, low, high] of shares [seeds, 1] of so many episodes; without seeds nothing."""
+    return _short(np.ravel(evaluation.over_seeds(table, episodes=episodes))) if table.size else []
 
 
 def _short(values: Any, *, digits: int = 4) -> list[float | None]:

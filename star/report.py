@@ -209,10 +209,9 @@ def profile_figure(path: Path, *, groups: Sequence[Row], taus: np.ndarray) -> No
         for number, group in enumerate(groups):
             found = group[measure]
             axis.step(taus, found["profile"], where="post", color=f"C{number}", label=literal(group["name"]))
-            if found["profile_interval"] is not None:
-                axis.fill_between(
-                    taus, *found["profile_interval"], step="post", color=f"C{number}", alpha=0.15, linewidth=0
-                )
+            axis.fill_between(
+                taus, *found["profile_interval"], step="post", color=f"C{number}", alpha=0.15, linewidth=0
+            )
         axis.set(xlabel=f"tau ({measure})", ylim=(-0.02, 1.02))
         axis.grid(alpha=0.3)
     axis.figure.axes[0].set_ylabel("share of seeds above tau")

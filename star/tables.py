@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from star.evaluation import MEASURES
+from star.evaluation import ABOVE, MEASURES
 
 _PLAIN_WIDTH = 200  # columns where nobody looks at a terminal
 _SHOWN = 3  # failed episodes named in a table
@@ -51,6 +51,9 @@ def evaluations(rows: Sequence[Row]) -> Table:
     for name in ("success_any", "success_final", "s to goal", "m to goal", "SPL", "end distance"):
         table.add_column(name, justify="right")
     table.add_column("failed")
+    several = any(len(row["seeds"]) > 1 for row in rows)
+    if several:
+        table.add_column(f"seeds above {ABOVE:g}")
     for row in rows:
         begin: list[Text | str] = [*(Text(row[name]) for name in about), f"{row['env_steps']:,}"]
         for seed in row["seeds"]:
@@ -59,41 +62,48 @@ def evaluations(rows: Sequence[Row]) -> Table:
             table.add_row(*begin, str(seed["seed"]), *_cells(seed), " ".join(failed) + more)
         if len(row["seeds"]) > 1:
             over = {f"{name}_interval": row[f"{name}_seeds_interval"] for name in MEASURES}
-            table.add_row(*begin, "all", *_cells({**row, **over}), "")
+            learnt = "\n".join(f"{name}: {_above(row[f'{name}_above'])}" for name in MEASURES)
+            table.add_row(*begin, "all", *_cells({**row, **over}), "", learnt)
     return table
 
 
 def groups(found: Sequence[Row]) -> Table:
-    """Interquartile means of groups of runs."""
-    table = Table(box=box.SIMPLE_HEAD, title="interquartile mean over seeds and tasks, 95 % stratified bootstrap")
-    if any(group["success_any"]["interquartile_mean_interval"] is None for group in found):
-        table.caption = "one seed has no interval"
-    for name in ("group", "runs", "seeds", "success_any", "success_final"):
+    """Means of groups of runs, and how many of their seeds have learnt the task."""
+    table = Table(box=box.SIMPLE_HEAD, title="mean over seeds and tasks, 95 % intervals")
+    if any(group["success_any"]["mean_interval"] is None for group in found):
+        table.caption = "one seed of a task has no interval"
+    for name in ("group", "runs", "seeds", *MEASURES, *(f"{name} above {ABOVE:g}" for name in MEASURES)):
         table.add_column(name, justify="left" if name == "group" else "right")
     for group in found:
         seeds = sum(len(scores) for scores in group["success_any"]["scores"].values())
-        measured = [
-            _interval(group[name]["interquartile_mean"], group[name]["interquartile_mean_interval"])
-            for name in MEASURES
-        ]
-        table.add_row(Text(group["name"]), str(len(group["runs"])), str(seeds), *measured)
+        measured = [_interval(group[name]["mean"], group[name]["mean_interval"]) for name in MEASURES]
+        learnt = [_above(group[name]["above"]) for name in MEASURES]
+        table.add_row(Text(group["name"]), str(len(group["runs"])), str(seeds), *measured, *learnt)
     return table
 
 
 def improvements(found: Sequence[Row]) -> Table:
-    """How likely a seed of one group is better than one of another; each pair once, in the order of the groups."""
-    table = Table(box=box.SIMPLE_HEAD, title="probability that a seed of A is better than one of B")
+    """How much better one group is than another; each pair once, in the order of the groups."""
+    table = Table(box=box.SIMPLE_HEAD, title="difference of means A - B, 95 % intervals (Welch), and P(A > B) of seeds")
     if any(pair["success_any"] is None for pair in found):
         table.caption = "-: no task in common"
-    for name in ("A", "B", "success_any", "success_final"):
-        table.add_column(name, justify="left" if len(name) == 1 else "right")
+    table.add_column("A")
+    table.add_column("B")
+    for name in MEASURES:
+        table.add_column(name, justify="right")
+        table.add_column("P", justify="right")
     seen: set[frozenset[str]] = set()
     for pair in found:
         both = frozenset((pair["better"], pair["than"]))
         if both in seen:
             continue
         seen.add(both)
-        measured = [_interval(pair[name], pair[f"{name}_interval"]) for name in MEASURES]
+        measured = []
+        for name in MEASURES:
+            measured += [
+                _interval(pair[f"{name}_difference"], pair[f"{name}_difference_interval"]),
+                "-" if pair[name] is None else f"{pair[name]:.2f}",
+            ]
         table.add_row(Text(pair["better"]), Text(pair["than"]), *measured)
     return table
 
@@ -109,6 +119,12 @@ def _cells(row: Row) -> list[str]:
     success = [_interval(row[name], row[f"{name}_interval"]) for name in MEASURES]
     means = (("seconds_to_goal", ".1f"), ("path_length", ".1f"), ("spl", ".2f"), ("distance", ".2f"))
     return [str(row["episodes"]), *success, *("-" if row[name] is None else format(row[name], f) for name, f in means)]
+
+
+def _above(found: Row) -> str:
+    """`4 of 5 [0.28, 0.99]`."""
+    low, high = found["interval"]
+    return escape(f"{found['seeds']} of {found['of']} [{low:.2f}, {high:.2f}]")
 
 
 def _interval(value: float | None, interval: Sequence[float] | None) -> str:

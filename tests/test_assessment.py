@@ -94,7 +94,9 @@ def test_intervals_are_over_episodes_for_a_seed_and_over_seeds_besides(evaluated
     assert row["episodes"] == 2 * EPISODES
     for name in ("success_any", "success_final"):
         low, high = row[f"{name}_seeds_interval"]
-        assert low <= row[name] <= high
+        assert low <= row[name] <= high and low < high
+        learnt = sum(seed[name] > 0.9 for seed in row["seeds"])
+        assert (row[f"{name}_above"]["seeds"], row[f"{name}_above"]["of"]) == (learnt, 2)
         assert row["seeds"][0][f"{name}_interval"][0] < row["seeds"][0][name]
     for seed in row["seeds"]:
         assert len(seed["failed"]) == round(EPISODES * (1 - seed["success_any"])) > 0

@@ -330,8 +330,9 @@ def test_evaluate_compares_groups_of_runs_and_each_other_run_by_itself(calls, fo
     assert [(group["name"], len(group["runs"])) for group in comparison["groups"]] == [("ours", 2), ("runs/old", 1)]
     assert comparison["groups"][0]["success_any"]["scores"] == {"point_maze": [0.5, 0.5]}
     assert [pair["success_final"] for pair in comparison["improvement"]] == [0.5, 0.5]
-    assert [group["success_any"]["interquartile_mean_interval"] for group in comparison["groups"]] == [[0.5, 0.5], None]
-    assert all(pair["success_any_interval"] is None for pair in comparison["improvement"])  # one seed on one side
+    ours, old = (group["success_any"] for group in comparison["groups"])
+    assert ours["mean_interval"] == [0.0, 1.0] and old["mean_interval"] is None  # one seed tells nothing of others
+    assert all(pair["success_any_difference_interval"] is None for pair in comparison["improvement"])
     assert (folder / "eval" / "evaluation.jsonl").read_text().splitlines() == lines
     assert {path.name for path in (folder / "eval").iterdir()} == {"evaluation.jsonl", "profile.png"}
     assert "eval/evaluation.jsonl: exists" in refusal(capsys, folder, "evaluate runs/old --out eval".split())

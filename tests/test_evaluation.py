@@ -5,6 +5,9 @@ import random
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
 
 from star import evaluation
 from star.agent.play import Episode
@@ -46,34 +49,79 @@ def slow_interval(groups, statistic):
 
 
 def test_the_interquartile_mean_of_groups_is_that_of_all_scores_with_draws_within_each_task():
-    middle, *interval = evaluation.pooled(GROUP, evaluation.interquartile_mean)
+    scores = {task: 5 * values for task, values in GROUP.items()}
+    middle, *interval = evaluation.pooled(scores, evaluation.interquartile_mean)
 
     def slow(group):
         return slow_interquartile_mean([x for scores in group.values() for x in scores])
 
-    assert middle == pytest.approx(slow(GROUP)) == pytest.approx((0.1 + 0.4 + 0.4 + 0.7 + 0.9) / 5)
-    np.testing.assert_allclose(interval, slow_interval([GROUP], slow), atol=0.05)
+    assert middle == pytest.approx(slow(scores))
+    np.testing.assert_allclose(interval, slow_interval([scores], slow), atol=0.05)
+    few, *unknown = evaluation.pooled(GROUP, evaluation.interquartile_mean)
+    assert few == pytest.approx((0.1 + 0.4 + 0.4 + 0.7 + 0.9) / 5) and np.isnan(unknown).all()
 
 
 def test_a_profile_is_the_share_of_scores_above_each_threshold():
-    share, low, high = evaluation.pooled(GROUP, evaluation.profile)
-
-    def slow(group):
-        scores = [x for values in group.values() for x in values]
-        return [sum(x > tau for x in scores) / len(scores) for tau in TAUS]
-
-    np.testing.assert_allclose(share, slow(GROUP))
+    every = np.array([x for values in GROUP.values() for x in values])
+    share, low, high = evaluation.profile(every)
+    np.testing.assert_allclose(share, [sum(x > tau for x in every) / len(every) for tau in TAUS])
     assert share[0] == 6 / 7 and share[-1] == 0.0
-    np.testing.assert_allclose([low, high], slow_interval([GROUP], slow), atol=0.15)
+    assert (low <= share).all() and (share <= high).all() and high[-1] == pytest.approx(1 - 0.025 ** (1 / 7))
 
 
 def test_the_probability_of_improvement_is_a_mean_over_common_tasks_of_pairs_with_half_a_tie():
-    middle, *interval = evaluation.improvement(GROUP, OTHER)
-    assert middle == pytest.approx(slow_improvement(GROUP, OTHER))
-    assert middle + evaluation.improvement(OTHER, GROUP)[0] == pytest.approx(1.0)
-    np.testing.assert_allclose(interval, slow_interval([GROUP, OTHER], slow_improvement), atol=0.05)
+    chance = evaluation.improvement(GROUP, OTHER)
+    assert chance == pytest.approx(slow_improvement(GROUP, OTHER))
+    assert chance + evaluation.improvement(OTHER, GROUP) == pytest.approx(1.0)
     assert evaluation.improvement({"maze": [1.0]}, {"fall": [0.0]}) is None
-    assert evaluation.improvement({"maze": [1.0, 1.0]}, {"maze": [0.0]}) == (1.0, 1.0, 1.0)
+    assert evaluation.improvement({"maze": [1.0, 1.0]}, {"maze": [0.0]}) == 1.0
+
+
+@settings(max_examples=30)
+@given(st.integers(2, 12), st.integers(2, 12), st.integers(0, 2**32 - 1))
+def test_intervals_are_those_of_the_textbook_where_seeds_differ(n, m, seed):
+    rng = np.random.default_rng(seed)
+    one, other = rng.normal(size=n), 3 + 2 * rng.normal(size=m)
+    mean, low, high = evaluation.over_seeds(one)
+    expected = stats.t.interval(0.95, n - 1, loc=one.mean(), scale=stats.sem(one))
+    np.testing.assert_allclose([mean, low, high], [one.mean(), *expected])
+    np.testing.assert_allclose(evaluation.over_tasks({"maze": one}), [mean, low, high])
+    apart = evaluation.difference({"maze": one}, {"maze": other})
+    welch = stats.ttest_ind(one, other, equal_var=False).confidence_interval()
+    np.testing.assert_allclose(apart, [one.mean() - other.mean(), welch.low, welch.high])
+
+
+@settings(max_examples=30)
+@given(st.sampled_from([0.0, 0.5, 0.98, 1.0]), st.integers(2, 10), st.integers(1, 500))
+def test_seeds_that_agree_leave_open_what_their_episodes_leave_open(score, n, episodes):
+    scores = np.full(n, round(score * episodes) / episodes)
+    for mean, low, high in (
+        evaluation.over_seeds(scores, episodes=episodes),
+        evaluation.over_tasks({"maze": scores}, episodes=episodes),
+    ):
+        assert 0 <= low <= mean <= high <= 1 and low < high
+    _, low, high = evaluation.difference({"maze": scores}, {"maze": scores}, episodes=episodes)
+    assert low < 0 < high
+
+
+def test_one_seed_tells_nothing_of_others():
+    assert np.isnan(evaluation.over_seeds(np.ones(1), episodes=100)[1:]).all()
+    assert np.isnan(evaluation.over_tasks({"maze": [1.0], "rooms": [0.5, 0.7]}, episodes=100)[1:]).all()
+    assert np.isnan(evaluation.difference({"maze": [1.0]}, {"maze": [0.5, 0.7]}, episodes=100)[1:]).all()
+    assert evaluation.difference({"maze": [1.0]}, {"fall": [0.5, 0.7]}) is None
+
+
+def test_how_many_seeds_have_learnt_comes_with_the_exact_interval():
+    found = evaluation.above([1.0, 0.95, 0.9, 0.0, 1.0])
+    assert (found["seeds"], found["of"]) == (3, 5)
+    np.testing.assert_allclose(found["interval"], [0.1466, 0.9473], atol=1e-4)
+
+
+@pytest.mark.parametrize("n", [3, 5, 10, 20])
+def test_of_normal_seeds_intervals_hold_the_truth_as_often_as_they_say(n):
+    rng = np.random.default_rng(n)
+    _, low, high = evaluation.over_seeds(rng.normal(0.6, 0.1, size=(n, 4000)), episodes=10_000)
+    assert 0.93 <= ((low < 0.6) & (0.6 < high)).mean() <= 0.97
 
 
 def test_a_single_score_stays_as_it_is_while_others_are_drawn():

@@ -39,8 +39,8 @@ function duration(seconds) {
   return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
 }
 function share(values) {
-  const [mean, low, high] = values.map(value => value.toFixed(2));
-  return [html("strong", {}, mean), low === high ? null : html("small", {}, ` [${low}, ${high}]`)];
+  const [mean, low, high] = values.map(value => value?.toFixed(2));
+  return [html("strong", {}, mean), low === undefined ? null : html("small", {}, ` [${low}, ${high}]`)];
 }
 function timeUnit(longest) {
   if (longest < 300) return { label: "wall-clock, s", factor: 1 };
@@ -124,7 +124,7 @@ function chart(host, make) {
       const lines = shown.map(one => {
         const i = one.x.reduce((best, value, j) => (Math.abs(value - x) < Math.abs(one.x[best] - x) ? j : best), 0);
         if (one.y[i] === null || one.x.at(-1) < x - last * 0.02) return null;
-        const range = one.low && !one.area && one.low[i] !== one.high[i] ? ` [${compact(one.low[i])}, ${compact(one.high[i])}]` : "";
+        const range = one.low && !one.area && one.low[i] !== null ? ` [${compact(one.low[i])}, ${compact(one.high[i])}]` : "";
         return html("div", {}, key(one.slot), `${one.name}: ${compact(one.y[i])}${range}`);
       });
       rule.setAttribute("x1", at(x));
@@ -204,7 +204,7 @@ function opening() {
   page.append(table(["run", "success at the last step", "success at any step", "seeds", "env steps per seed", "wall-clock",
     "env steps/s", "regions"], rows, { class: "runs" }));
   page.append(html("p", { class: "note" }, "Success: share of greedy episodes on test goals in the last evaluation, mean over "
-    + "seeds with the 95 % bootstrap interval of that mean. Env steps/s: of all seeds together, median of the epochs."));
+    + "seeds with the 95 % interval of that mean (Student's t). Env steps/s: of all seeds together, median of the epochs."));
 }
 
 function success() {
@@ -221,7 +221,7 @@ function success() {
   }));
   const set = name => value => { chosen[name] = value; drawn.redraw(); };
   section("success", "Success on test goals",
-    "Mean over seeds of the share of greedy episodes that reach the goal; the band is the 95 % bootstrap interval of that mean.",
+    "Mean over seeds of the share of greedy episodes that reach the goal; the band is the 95 % interval of that mean (Student's t).",
     html("div", { class: "controls" },
       choice("measure", [["success_final", "at the last step"], ["success_any", "at any step"]], set("measure")),
       choice("clock", [["env_steps", "env steps"], ["wall_s", "wall-clock"]], set("clock")),
