@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from envs import ant, point, tasks
+from envs.common import modes
+from envs.common.plainly import plain
 from envs.maze import Body, MazeEnv
 from envs.options import EnvError, known, resolve
 from envs.tasks import TASKS, Task
@@ -24,11 +26,15 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
     Raises:
       EnvError: in one line, if a name, value or map is wrong, or the engine cannot run here.
     """
+    modes.check()
     if name not in TASKS:
         raise EnvError(f'task "{name}" is unknown; {known(name, TASKS)}')
     task = TASKS[name]
     if engine not in task.engines:
         raise EnvError(f'engine "{engine}" is not one of {name}; {known(engine, task.engines)}')
+    options = {key: plain(value) for key, value in options.items()}
+    if isinstance(options.get("map"), list) and all(isinstance(row, str) for row in options["map"]):
+        options["map"] = "\n".join(options["map"]) + "\n"
     chosen = resolve(name, task.options(), options)
     if chosen.get("map") is not None:
         task = tasks.own(task.body, chosen["map"], cell=chosen["cell"])

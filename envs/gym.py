@@ -29,6 +29,7 @@ from gymnasium.vector.utils import batch_space
 
 import envs
 from envs.arena import Arena
+from envs.common.plainly import plain
 from envs.maze import MazeEnv
 
 Observation = dict[str, np.ndarray]
@@ -61,7 +62,31 @@ class Record(NamedTuple):
     fault: np.ndarray
 
 
-class GymEnv(gymnasium.Env[Observation, np.ndarray]):
+class _Travels:
+    """What of an environment goes through pickle: how it was made, and the arrays of its state."""
+
+    _made: tuple[str, dict[str, Any], int]
+    _program: Program
+    _state: Any
+
+    def __getstate__(self) -> dict[str, Any]:
+        left = {"_program", "maze"}
+        kept = {name: value for name, value in vars(self).items() if name not in left}
+        if self._state is not None:
+            kept["_state"] = [np.asarray(_raw(leaf)) for leaf in jax.tree.leaves(self._state)]
+        return kept
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        vars(self).update(kept)
+        self._program = program(*self._made)
+        self.maze = self._program.env
+        if self._state is not None:
+            blank, structure = jax.tree.flatten(self._program.blank)
+            leaves = [_like(one, array) for one, array in zip(blank, self._state, strict=True)]
+            self._state = jax.tree.unflatten(structure, leaves)
+
+
+class GymEnv(_Travels, gymnasium.Env[Observation, np.ndarray]):
     """One environment. `maze` is the `MazeEnv` that it runs.
 
     An episode is truncated after `episode_length` steps, and by a fault of the simulator, which sets `info["fault"]`.
@@ -85,7 +110,8 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         Raises:
           EnvError: in one line, if a name or value is wrong, or the engine cannot run here.
         """
-        self._program = program(task, options, 1)
+        self._made = task, options, 1
+        self._program = program(*self._made)
         self.maze = self._program.env
         self.observation_space, self.action_space = spaces(self.maze)
         self.metadata = self.metadata | {"render_fps": max(round(1 / self.maze.dt), 1)}
@@ -128,7 +154,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         return _picture(self.maze, _started(self._state), 0, self._picture)
 
 
-class GymVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarray]):
+class GymVectorEnv(_Travels, gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarray]):
     """`num_envs` (B) environments in one batch. One that ends begins its next episode within the same step.
 
     Observation and info are then those of the new episode, `infos["final_obs"]` and `infos["final_info"]` those of
@@ -149,9 +175,11 @@ class GymVectorEnv(gymnasium.vector.VectorEnv[Observation, np.ndarray, np.ndarra
         **options: Any,
     ):
         """Make a batch of `task`; all else as for `GymEnv`."""
+        num_envs = plain(num_envs)
         if type(num_envs) is not int or num_envs < 1:
             raise envs.EnvError(f"num_envs is {num_envs!r}; allowed: a whole number above 0")
-        self._program = program(task, options, num_envs)
+        self._made = task, options, num_envs
+        self._program = program(*self._made)
         self.maze = self._program.env
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = spaces(self.maze)
@@ -294,6 +322,17 @@ def _masked(info: Info, mask: np.ndarray) -> Info:
     """Info as Gymnasium's vector environments give it: 0 outside of the mask, and the mask under `_key`."""
     values = {key: np.where(mask, value, np.zeros_like(value)) for key, value in info.items()}
     return values | {f"_{key}": mask.copy() for key in info}
+
+
+def _raw(leaf: jax.Array) -> jax.Array:
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+
+
+def _like(leaf: jax.Array, array: np.ndarray) -> jax.Array:
+    """`array` on a device, as a key where `leaf` is one."""
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(leaf))
+    return jnp.asarray(array)
 
 
 def _bits(generator: np.random.Generator) -> np.ndarray:

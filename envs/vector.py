@@ -11,11 +11,15 @@ result back. On a mesh of devices each does so with its share of the B.
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
 from envs._quiet import Env, State
 from envs.common.batching import flattened, shared_out, where
+from envs.common.errors import UserError
 
 
 class VectorEnv:
@@ -28,18 +32,30 @@ class VectorEnv:
     """
 
     def __init__(self, env: Env, num_envs: int, *, auto_reset: bool = True):
+        if num_envs < 1:
+            raise UserError(f"num_envs is {num_envs}; allowed: a whole number above 0")
         self.env = env
         self.num_envs = num_envs
         self.auto_reset = auto_reset
         self._step = shared_out(flattened(self._step_batch))
         self._reset_where = shared_out(flattened(self._reset_batch))
 
+    def __reduce__(self) -> Any:
+        return partial(type(self), auto_reset=self.auto_reset), (self.env, self.num_envs)
+
     def reset(self, rng: jax.Array) -> State:
         """New episodes [B] from one key, typed or raw."""
         return self._begin(jax.random.split(rng, self.num_envs))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """One env step of every environment; `action` [B, action_size]."""
+        """One env step of every environment; `action` [B, action_size].
+
+        Raises:
+          UserError: in one line, for an action of another shape.
+        """
+        expected = (self.num_envs, self.env.action_size)
+        if jnp.shape(action) != expected:
+            raise UserError(f"the shape of the actions is {jnp.shape(action)}; allowed: {expected}")
         return self._step(state, action)
 
     def reset_where(self, state: State, mask: jax.Array, rng: jax.Array) -> State:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import yaml
 from rich.console import Console
 
-from envs.common import reading
+from envs.common import modes, reading
 from envs.common.errors import UserError
 from star.agent.sections import Config
 from star.config import plugins
@@ -91,6 +91,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         code = _run(sys.argv[1:] if arguments is None else list(arguments))
     except UserError as error:
         print(f"error: {_on_one_line(str(error))}", file=sys.stderr)
+        code = 2
+    except (RuntimeError, AssertionError):
+        line = modes.missing_device()
+        if line is None:
+            raise
+        print(f"error: {line}", file=sys.stderr)
         code = 2
     except KeyboardInterrupt:
         code = 130
@@ -372,11 +378,17 @@ def _say_how_it_ended(result: Result, config: TrainerConfig) -> None:
         print(f"stopped: {result.fault}; {_after_a_fault(result, config)}", file=sys.stderr)
         return
     if result.interrupted:
-        print(f"interrupted at {result.env_steps:,} env steps; go on with: star train --resume {run_dir}")
+        print(f"interrupted at {result.env_steps:,} env steps; go on with: star train --resume {_typed(run_dir)}")
         return
     success = "" if result.success_final is None else f", success_final {result.success_final:.2f} on test goals"
     print(f"trained {result.env_steps:,} env steps{success}")
-    print(f"figure:  {run_dir}/figures/summary.png\nmetrics: {run_dir}/metrics.jsonl\nnext:    star evaluate {run_dir}")
+    print(f"figure:  {run_dir}/figures/summary.png\nmetrics: {run_dir}/metrics.jsonl")
+    print(f"next:    star evaluate {_typed(run_dir)}")
+
+
+def _typed(path: Path) -> str:
+    """A path as one types it in a shell."""
+    return shlex.quote(str(path))
 
 
 def _after_a_fault(result: Result, config: TrainerConfig) -> str:
@@ -388,7 +400,7 @@ def _after_a_fault(result: Result, config: TrainerConfig) -> str:
         return f"there is no checkpoint from before; begin anew with {flags}"
     return (
         f"the checkpoint of {result.saved:,} env steps is sound; "
-        f"go on with: star train --resume {result.run_dir} {flags}"
+        f"go on with: star train --resume {_typed(result.run_dir)} {flags}"
     )
 
 
@@ -410,7 +422,8 @@ def _sweep(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     if summary.best is None:
         print("no trial was completed")
         return 1
-    print(f"figures: {out}/figures/\nbest:    trial {summary.best['trial']}\nnext:    star train {out}/best.yaml")
+    print(f"figures: {out}/figures/\nbest:    trial {summary.best['trial']}")
+    print(f"next:    star train {_typed(out / 'best.yaml')}")
     return 0
 
 

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 from envs.common import reading
 from envs.common.errors import shown
 from envs.common.files import nearest_file
+from envs.common.plainly import plain
 from star.agent.sections import Config
 from star.config.section import ConfigError, Section
 
@@ -68,7 +69,7 @@ def parse(
     values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, *, source: str = "configuration"
 ) -> Config:
     """Validate nested `values` after applying dotted `overrides`; raises `UserError`."""
-    nested = _with_overrides(values, overrides or {})
+    nested = _with_overrides(plain(values), plain(overrides or {}))
     try:
         return Config.model_validate(nested)
     except ValidationError as error:
@@ -152,8 +153,8 @@ def explain(error: ErrorDetails, model: type[BaseModel] = Config) -> str:
     if error["type"] == "extra_forbidden":
         return f"{key}: unknown key{_nearest_key(path, model)}"
     message = error["msg"].removeprefix("Value error, ").replace("Input should be", "should be")
-    for words, plain in _PLAIN.items():
-        message = re.sub(words, plain, message)
+    for words, ours in _PLAIN.items():
+        message = re.sub(words, ours, message)
     message = message[:1].lower() + message[1:]
     if error["type"] == "value_error" and not isinstance(error["input"], str | int | float | bool):
         return f"{key}: {message}" if key else message

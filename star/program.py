@@ -15,6 +15,7 @@ from jax.sharding import Mesh
 
 import envs
 from envs import arena
+from envs.common import modes
 from envs.vector import VectorEnv
 from star import devices, faults, learners
 from star.agent import checks, levels, play
@@ -169,6 +170,7 @@ def select_device(device: str) -> None:
     """Make JAX use the device that `trainer.device` asks for; raises `UserError` if there is none."""
     if device == "cpu":
         jax.config.update("jax_platforms", "cpu")
+    modes.check()
     if device == "gpu" and jax.default_backend() != "gpu":
         raise ConfigError(
             f"trainer.device: 'gpu' is not available, JAX sees only {jax.default_backend()}; "

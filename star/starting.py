@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,12 @@ _BEGUN = (lock.NAME, ".config-")  # of a run that was killed before its config.y
 
 def make(run_dir: Path) -> None:
     """Make the folder of a new run; what a process that was killed at once left there does no harm."""
+    files.check_name(run_dir)
     try:
         used = run_dir.is_dir() and any(not entry.name.startswith(_BEGUN) for entry in run_dir.iterdir())
         if used or (run_dir.exists() and not run_dir.is_dir()):
-            raise ConfigError(
-                f"{run_dir}: is not empty; choose another --run-dir, or go on with it: star train --resume {run_dir}"
-            )
+            again = f"star train --resume {shlex.quote(str(run_dir))}"
+            raise ConfigError(f"{run_dir}: is not empty; choose another --run-dir, or go on with it: {again}")
         devices.wait("the run directory is empty")
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -12,8 +12,17 @@ from pathlib import Path
 from envs.common.errors import UserError
 
 
+def check_name(path: Path) -> None:
+    """Raise `UserError` for a path that is not UTF-8: what is written below it could not name its place."""
+    try:
+        os.fspath(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise UserError(f"{path}: the name is not UTF-8") from None
+
+
 def check(path: Path, endings: Sequence[str], *, force: bool = False) -> None:
     """Raise `UserError` in one line if `path` cannot be written, or would be replaced without `force`."""
+    check_name(path)
     try:
         if path.is_dir():
             raise UserError(f"{path}: is a folder")

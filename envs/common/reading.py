@@ -29,7 +29,7 @@ def text(path: Path) -> str:
     """
     try:
         check_regular(path)
-        with path.open(encoding="utf-8") as file:
+        with path.open(encoding="utf-8-sig") as file:
             found = file.read(MAX_CHARACTERS + 1)
     except ValueError as error:
         if isinstance(error, UnicodeDecodeError):

@@ -230,9 +230,9 @@ def refine(
 ) -> tuple[Graph, Change, Metrics]:
     """Examine the due pairs of one epoch, at most `pairs_per_epoch`, and cut where a verdict is mixed.
 
-    `cube` is `Spec.cube`. Of the due pairs, those commanded most and waiting longest come first; `weight` multiplies the
-    urgency of those that lead to each region. Returns the graph of the new regions, and the change that tables indexed
-    by region have to follow, with [pairs_per_epoch * cuts_per_pair] splits.
+    `cube` is `Spec.cube`. Of the due pairs, those commanded most and waiting longest come first; `weight` multiplies
+    the urgency of those that lead to each region. Returns the graph of the new regions, and the change that tables
+    indexed by region have to follow, with [pairs_per_epoch * cuts_per_pair] splits.
     """
     graph, before = forget(config, graph), abstraction
     starts, seen = forward_model.visited(model)

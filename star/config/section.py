@@ -16,6 +16,7 @@ class ConfigError(UserError):
 
 
 _LARGEST = 3.4e38  # of float32, in round numbers
+_SMALLEST = 1.2e-38
 
 
 class Section(BaseModel):
@@ -35,6 +36,8 @@ class Section(BaseModel):
     def _refuse_what_float32_cannot_hold(cls, value: Any) -> Any:
         if isinstance(value, float) and abs(value) > _LARGEST:
             raise ValueError(f"should lie between {-_LARGEST:.3g} and {_LARGEST:.3g}")
+        if isinstance(value, float) and 0 < abs(value) < _SMALLEST:
+            raise ValueError(f"should be 0 or at least {_SMALLEST:.3g}: float32 makes 0 of it")
         return value
 
     @classmethod

@@ -1,0 +1,29 @@
+"""The modes of JAX that this project does not run in."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import jax
+
+from envs.common.errors import UserError
+
+
+def check() -> None:
+    """Raise `UserError` in one line that names the mode, if numbers would not be float32, or types not promoted."""
+    config: Any = jax.config  # its values are told of by no stub
+    if config.jax_enable_x64:
+        raise UserError("JAX_ENABLE_X64: is on; all of this computes with float32: switch it off")
+    if config.jax_numpy_dtype_promotion != "standard":
+        raise UserError("JAX_NUMPY_DTYPE_PROMOTION: is strict; allowed: standard")
+
+
+def missing_device() -> str | None:
+    """The line for a person, if JAX has none of the devices that JAX_PLATFORMS names; None if it has one."""
+    try:
+        jax.default_backend()
+    except (RuntimeError, AssertionError):  # the latter is what JAX raises where CUDA is not installed
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        return f"JAX_PLATFORMS: {asked!r} is not available here; allowed: cpu, or not set: what JAX finds by itself"
+    return None
