@@ -13,6 +13,8 @@ from star.agent.sections import AgentConfig, Config
 from star.agent.subgoals import Boxes, Points
 from star.spec import Spec
 
+INSIDE = 0.7  # of the cube inside the ball of success: agents stop at the edge of the box they are sent to
+
 
 class Task(NamedTuple):
     """The environment, and what is set in it."""
@@ -26,7 +28,7 @@ class Task(NamedTuple):
     @classmethod
     def of(cls, config: AgentConfig | Config, spec: Spec) -> Task:
         """The task as the levels of `config` see it."""
-        margin = jnp.minimum(config.commander.goal_margin, spec.cube)
+        margin = jnp.minimum(config.commander.goal_margin, INSIDE * spec.cube)
         if config.tutor.enabled:
             return cls(spec, Points(len(spec.scale)), margin)
         return cls(spec, Boxes(2 * len(spec.abstract_indices), margin), margin)
