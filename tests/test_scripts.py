@@ -171,7 +171,7 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
     assert {seed["training_seconds_to_level"] for seed in kept["seeds"]} == {5.0}
     script.main(["point_maze", "star", "--seeds", "1", "--out", str(tmp_path / "c"), *common, "--", "--seed", "7"])
     assert trained[-1] == [0] and len(list((tmp_path / "runs" / "point_maze").glob("star-0-*"))) == 2
-    assert "| star | 5 | 0.5 k | 1.00 [1.00, 1.00] | 0.50 [" in (tmp_path / "a" / "table.md").read_text()
+    assert "| star | 5 | 0.5 k | 1.000 [0.996, 1.000] | 0.500 [" in (tmp_path / "a" / "table.md").read_text()
     (tmp_path / "a" / "star.json").unlink()
     (tmp_path / "a" / "notes.json").write_text("not a report", encoding="utf-8")
     script.main(["point_maze", "star", "--out", str(tmp_path / "a"), "--runs", str(tmp_path / "others")])

@@ -209,7 +209,7 @@ def test_dimensions_that_the_goal_leaves_open_keep_the_bounds_of_the_region(tiny
         subgoal_scale=(1.0, 1.0, 1.0),
         space=((0.0, 0.0, 0.0), (8.0, 8.0, 8.0)),
         region_cuts=((), (), (4.0,)),
-        success_radius=1.0,
+        success_radius=5.0,
     )
     obs = jnp.array([[1.0, 2.0, 9.0, 5.0, 7.0, 6.0]])  # state 1, 2, 9, 5; goal y = 7, x = 6
     point = spec.goal_point(obs)
