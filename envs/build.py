@@ -7,9 +7,8 @@ from typing import Any
 
 from envs import ant, point, tasks
 from envs.common import modes
-from envs.common.plainly import plain
 from envs.maze import Body, MazeEnv
-from envs.options import EnvError, known, resolve
+from envs.options import EnvError, known, normal, resolve
 from envs.tasks import TASKS, Task
 
 BODIES: Mapping[str, Callable[[Task, str, Mapping[str, Any]], Body]] = {"ant": ant.build, "point": point.build}
@@ -25,6 +24,7 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
 
     Raises:
       EnvError: in one line, if a name, value or map is wrong, or the engine cannot run here.
+      UserError: in one line that names the mode, if JAX is in one that nothing here runs in.
     """
     modes.check()
     if name not in TASKS:
@@ -32,9 +32,7 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
     task = TASKS[name]
     if engine not in task.engines:
         raise EnvError(f'engine "{engine}" is not one of {name}; {known(engine, task.engines)}')
-    options = {key: plain(value) for key, value in options.items()}
-    if isinstance(options.get("map"), list) and all(isinstance(row, str) for row in options["map"]):
-        options["map"] = "\n".join(options["map"]) + "\n"
+    options = normal(options)
     chosen = resolve(name, task.options(), options)
     if chosen.get("map") is not None:
         task = tasks.own(task.body, chosen["map"], cell=chosen["cell"])

@@ -31,6 +31,7 @@ import envs
 from envs.arena import Arena
 from envs.common.plainly import plain
 from envs.maze import MazeEnv
+from envs.options import normal
 
 Observation = dict[str, np.ndarray]
 Info = dict[str, Any]
@@ -242,6 +243,7 @@ class GymVectorEnv(_Travels, gymnasium.vector.VectorEnv[Observation, np.ndarray,
 
 def program(task: str, options: dict[str, Any], num_envs: int) -> Program:
     """The program of a batch, compiled at most once; raises `EnvError` if the options are wrong."""
+    options = normal(options)
     arena = envs.make(task, **options).arena  # the file of a map may have changed
     return _compiled(task, arena, num_envs, **dict(sorted(options.items())))
 

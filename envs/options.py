@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from envs.common.errors import UserError, shown
+from envs.common.plainly import plain
 
 
 class EnvError(UserError):
@@ -47,6 +48,15 @@ def number(default: float | None, low: float, high: float, unit: str = "") -> Op
     """A number from `low` to `high`."""
     words = f"a number from {low:g} to {high:g}" + (f" {unit}" if unit else "")
     return Option(default, lambda value: type(value) in (int, float) and low <= value <= high, words)
+
+
+def normal(given: Mapping[str, Any]) -> dict[str, Any]:
+    """`given` in the types that YAML has, and a map given as a list of rows as their text."""
+    options = {key: plain(value) for key, value in given.items()}
+    rows = options.get("map")
+    if isinstance(rows, list) and all(isinstance(row, str) for row in rows):
+        options["map"] = "\n".join(rows) + "\n"
+    return options
 
 
 def resolve(task: str, options: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from jax.sharding import Mesh
 
 import envs
 from envs import arena
-from envs.common import modes
+from envs.options import normal
 from envs.vector import VectorEnv
 from star import devices, faults, learners
 from star.agent import checks, levels, play
@@ -170,7 +170,6 @@ def select_device(device: str) -> None:
     """Make JAX use the device that `trainer.device` asks for; raises `UserError` if there is none."""
     if device == "cpu":
         jax.config.update("jax_platforms", "cpu")
-    modes.check()
     if device == "gpu" and jax.default_backend() != "gpu":
         raise ConfigError(
             f"trainer.device: 'gpu' is not available, JAX sees only {jax.default_backend()}; "
@@ -182,7 +181,8 @@ def resolve(config: Config, engine: str, spec: Spec) -> Config:
     """`config` with the engine, the map and the initial cuts that are really used."""
     values = config.model_dump(mode="json")
     values["env"]["engine"] = engine
-    for options in (values["env"]["options"], values["env"]["training"]):
+    for key in ("options", "training"):
+        options = values["env"][key] = normal(values["env"][key])
         if "map" in options:  # the run must not change with the file
             options["map"] = arena.load(options["map"])
     if values["abstraction"]["cuts"] is None and values["abstraction"]["grid"] is None:

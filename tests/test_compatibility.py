@@ -18,7 +18,9 @@ import pytest
 import envs
 from envs.common.errors import UserError
 from star import cli
+from star import program as programs
 from star.loading import parse
+from star.spec import Spec
 
 ROOT = Path(__file__).parents[1]
 
@@ -107,6 +109,16 @@ def test_options_take_what_their_plain_twins_take(name, value, plain):
         theirs.success_radius,
     )
     assert parse({"env": {"options": {name: value}}}).env.options[name] in (plain, ROWS)
+
+
+@pytest.mark.parametrize("rows", [ROWS, tuple(ROWS), np.array(ROWS)])
+def test_rows_of_a_map_are_its_text_in_a_run_and_in_gymnasium(rows):
+    text = "\n".join(ROWS) + "\n"
+    config = parse({"env": {"options": {"map": rows}}})
+    resolved = programs.resolve(config, "jax", Spec.of(programs.make_env(config, "test")))
+    assert resolved.env.options["map"] == text
+    made = gymnasium.make("star/PointMaze-v0", map=rows, episode_length=np.array(20)).unwrapped
+    assert made.maze.arena == envs.make("point_maze", map=text).arena
 
 
 def test_settings_take_numbers_of_numpy_and_paths(tmp_path):
