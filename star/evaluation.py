@@ -6,7 +6,7 @@ The equations are in docs/evaluation.md.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -102,8 +102,7 @@ def weighted_success(reached: np.ndarray, path: np.ndarray, shortest: np.ndarray
 
 def proportion_interval(successes: int, trials: int) -> list[float]:
     """Wilson score interval of a proportion at 95 %."""
-    interval = stats.binomtest(successes, trials).proportion_ci(0.95, method="wilson")
-    return [float(interval.low), float(interval.high)]
+    return _proportion(successes, trials, "wilson")
 
 
 def over_seeds(scores: np.ndarray, *, episodes: int | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -139,16 +138,20 @@ def difference(better: Scores, than: Scores, *, episodes: int | None = None) -> 
 
     None if they have no task in common; NaN for `low` and `high` where either has only one seed of one.
     """
-    common = [task for task in better if task in than]
-    if not common:
+    pairs = _on_common_tasks(better, than)
+    if not pairs:
         return None
-    pairs = [(np.asarray(better[task], float), np.asarray(than[task], float)) for task in common]
     mean = float(np.mean([x.mean() - y.mean() for x, y in pairs]))
     samples = [x for pair in pairs for x in pair]
     if min(map(len, samples)) < 2:
         return mean, np.nan, np.nan
-    low, high = _student(mean, [(_variance(x, episodes) / len(common) ** 2, len(x) - 1) for x in samples])
+    low, high = _student(mean, [(_variance(x, episodes) / len(pairs) ** 2, len(x) - 1) for x in samples])
     return mean, float(low), float(high)
+
+
+def _on_common_tasks(better: Scores, than: Scores) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The scores of both groups on each task that both have."""
+    return [(np.asarray(better[task], float), np.asarray(than[task], float)) for task in better if task in than]
 
 
 def _variance(scores: np.ndarray, episodes: int | None) -> np.ndarray:
@@ -174,7 +177,11 @@ def _student(middle: Any, terms: Sequence[tuple[Any, int]]) -> tuple[Any, Any]:
 
 def exact_interval(successes: int, trials: int) -> list[float]:
     """Clopper-Pearson interval of a proportion at 95 %: right also for the few seeds of a table."""
-    interval = stats.binomtest(int(successes), trials).proportion_ci(0.95, method="exact")
+    return _proportion(successes, trials, "exact")
+
+
+def _proportion(successes: int, trials: int, method: Literal["wilson", "exact"]) -> list[float]:
+    interval = stats.binomtest(int(successes), trials).proportion_ci(0.95, method=method)
     return [float(interval.low), float(interval.high)]
 
 
@@ -247,10 +254,9 @@ def improvement(better: Scores, than: Scores) -> float | None:
 
     None if they have no task in common.
     """
-    common = [task for task in better if task in than]
-    if not common:
+    pairs = _on_common_tasks(better, than)
+    if not pairs:
         return None
-    pairs = [(np.asarray(better[task], float), np.asarray(than[task], float)) for task in common]
     return float(np.mean([(np.sign(x[:, None] - y).mean() + 1) / 2 for x, y in pairs]))
 
 

@@ -192,7 +192,7 @@ def experience(
         region=memory.region,
         goal_region=memory.goal_region,
         target=memory.target,
-        reward=where(segment.lost > 0, lost_reward(section, memory.reward, last), memory.reward),
+        reward=jnp.where(segment.lost > 0, lost_reward(section, memory.reward, last), memory.reward),
         next_region=regions.locate(roadmap.abstraction, end),
         weight=weight,
         lost=lost,
