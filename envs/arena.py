@@ -13,8 +13,9 @@ floor, the floor of all others is raised by as much.
 from __future__ import annotations
 
 import re
+import warnings
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import floor
@@ -25,7 +26,7 @@ import numpy as np
 import yaml
 
 from envs.common import reading
-from envs.common.errors import shown
+from envs.common.errors import Notice, shown
 from envs.options import EnvError
 
 WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE = "10rg#BD"
@@ -143,17 +144,23 @@ def read(source: str, *, cell: float) -> Arena:
     """The arena of a user's map: the path of a file, or what would be in it if `source` has several lines.
 
     It is either the rows as plain text, or YAML with the rows as a block of text under `map` and, if wanted, `cell`
-    (m) and `block` (axes). `cell` is the size of cells that the map does not give.
+    (m) and `block` (axes). `cell` is the size of cells that the map does not give. Free cells that cannot be reached
+    become walls, which a `Notice` tells.
 
     Raises:
       EnvError: in one line that names the file, and the row and column counted from 1.
     """
     source = source.strip()
     name, text = "map" if "\n" in source else f"map {_short(source)}", load(source)
-    return check(
-        _from_yaml(text, cell, name=name) if re.search(r"^\s*\w+\s*:", text, re.M) else Arena(_rows(text), cell),
-        name=name,
-    )
+    yaml_map = re.search(r"^\s*\w+\s*:", text, re.M)
+    arena = check(_from_yaml(text, cell, name=name) if yaml_map else Arena(_rows(text), cell), name=name)
+    sealed = unreached(arena)
+    if sealed:
+        r, c = sealed[0]
+        cells = "1 free cell" if len(sealed) == 1 else f"{len(sealed)} free cells"
+        where = f'cannot be reached from "{ROBOT}", the first at row {r + 1}, column {c + 1}'
+        warnings.warn(Notice(f"{name}: {cells} {where}: taken for walls, without goals or starts"), stacklevel=2)
+    return walled(arena, sealed)
 
 
 def load(source: str) -> str:
@@ -212,15 +219,28 @@ def check(arena: Arena, *, name: str) -> Arena:
                 raise EnvError(f"{name}: row {r + 1}, column {c + 1} is {symbol!r}; the outline must be walls (1)")
     if not any(arena.cells(ROBOT)):
         raise EnvError(f'{name}: has no start; mark the cell of the robot with "{ROBOT}"')
-    if not any(arena.cells(FREE + GOAL)):
-        raise EnvError(f'{name}: has no free cell beside the start; mark free cells with "{FREE}"')
     if any(arena.cells(BLOCK)) and "z" in arena.block and not arena.floor_height:
         raise EnvError(f"{name}: block is {arena.block!r}, but no cell is without floor ({CHASM}) to fall into")
-    reached = _walk(arena)
+    reached = _walk(arena).keys()
     for r, c in arena.cells(GOAL):
         if (r, c) not in reached:
             raise EnvError(f'{name}: the goal at row {r + 1}, column {c + 1} cannot be reached from "{ROBOT}"')
+    if reached.isdisjoint(arena.cells(FREE + GOAL)):
+        raise EnvError(f'{name}: has no free cell beside the start; mark free cells with "{FREE}"')
     return arena
+
+
+def unreached(arena: Arena) -> list[Cell]:
+    """The free cells (row, column) to which no way leads from the start, row by row."""
+    reached = _walk(arena)
+    return [cell for cell in arena.cells(FREE) if cell not in reached]
+
+
+def walled(arena: Arena, cells: Iterable[Cell]) -> Arena:
+    """`arena` with walls in place of `cells`."""
+    filled = set(cells)
+    rows = ("".join(WALL if (r, c) in filled else s for c, s in enumerate(row)) for r, row in enumerate(arena.rows))
+    return replace(arena, rows=tuple(rows))
 
 
 def farthest(arena: Arena) -> tuple[float, float]:

@@ -14,7 +14,7 @@ differ in the last bit from what `compute_reward` makes of the same goals.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Dict
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -45,7 +46,8 @@ class Program(NamedTuple):
     """The compiled functions of a batch of B environments. Both return the new state and a record of it.
 
     `step` takes a state and actions [B, action_size]; `begin` a state, a mask (bool [B]) of the environments that
-    begin an episode, and 64 random bits (uint32 [2]). `blank` is a state to begin from.
+    begin an episode, and 64 random bits for all (uint32 [1, 2]) or for each (uint32 [B, 2]). `blank` is a state to
+    begin from.
     """
 
     env: MazeEnv
@@ -127,9 +129,9 @@ class GymEnv(_Travels, gymnasium.Env[Observation, np.ndarray]):
           ValueError: in one line, if `options` names any option: there are none.
         """
         _check_options(options)
-        super().reset(seed=seed)
+        super().reset(seed=plain(seed))
         everyone = np.ones(1, bool)
-        self._state, array = self._program.begin(self._program.blank, everyone, _bits(self.np_random))
+        self._state, array = self._program.begin(self._program.blank, everyone, _bits([self.np_random]))
         record = _read(self.maze, array)
         return _first(goals(self.maze, record.obs)), _first(_info(self.maze, record.obs))
 
@@ -190,15 +192,26 @@ class GymVectorEnv(_Travels, gymnasium.vector.VectorEnv[Observation, np.ndarray,
         self.render_mode = _checked_mode(render_mode)
         self._picture = {"width": width, "height": height, "camera": camera}
         self._state: Any = None
+        self._generators: list[np.random.Generator] | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, Info]:
         """Begin all episodes, or those of `options["reset_mask"]` (bool [B]) alone.
 
+        One seed is of the whole batch. Of a list [B] each environment has its own: its episodes start as those of a
+        `GymEnv` with that seed. None in it leaves an environment's stream as it is.
+
         Raises:
-          ValueError: in one line, if the mask is wrong or `options` names another option.
+          ValueError: in one line, if the mask or the number of seeds is wrong, or `options` names another option.
         """
         _check_options(options, "reset_mask")
-        super().reset(seed=seed)
+        seed = plain(seed)
+        if isinstance(seed, list):
+            self._generators = _seeded(seed, self._generators, self.num_envs)
+        else:
+            super().reset(seed=seed)  # type: ignore[arg-type]  # `plain` tells nothing of types
+            self._generators = None if seed is not None else self._generators
         mask = (options or {}).get("reset_mask")
         if mask is None:
             before, mask = self._program.blank, np.ones(self.num_envs, bool)
@@ -226,8 +239,16 @@ class GymVectorEnv(_Travels, gymnasium.vector.VectorEnv[Observation, np.ndarray,
 
     def _begin(self, state: Any, mask: np.ndarray) -> np.ndarray:
         """Begin new episodes where the mask says so; returns all observations [B, n]."""
-        self._state, array = self._program.begin(state, mask, _bits(self.np_random))
+        self._state, array = self._program.begin(state, mask, self._drawn(mask))
         return _read(self.maze, array).obs
+
+    def _drawn(self, mask: np.ndarray) -> np.ndarray:
+        """Random bits for the environments of the mask: a generator that they do not share draws for them alone."""
+        if self._generators is None:
+            return _bits([self.np_random])
+        bits = np.zeros((self.num_envs, 2), np.uint32)
+        bits[mask] = _bits([one for one, begins in zip(self._generators, mask, strict=True) if begins])
+        return bits
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
         """The reward [...] for goals [..., k], to the bit that of a step that ends in them. `info` is not used."""
@@ -254,20 +275,21 @@ def _compiled(task: str, arena: Arena, num_envs: int, **options: Any) -> Program
     vector = envs.VectorEnv(env, num_envs, auto_reset=False)
 
     def begin(state: Any, mask: jax.Array, bits: jax.Array) -> tuple[Any, jax.Array]:
-        return recorded(vector.reset_where(state, mask, key(bits)))
+        return recorded(vector.reset_where(state, mask, keys(bits)))
 
     def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
         return recorded(vector.step(state, action))
 
-    def key(bits: jax.Array) -> jax.Array:
-        return jax.random.wrap_key_data(bits, impl="threefry2x32")
+    def keys(bits: jax.Array) -> jax.Array:
+        key = jax.random.wrap_key_data(bits, impl="threefry2x32")
+        return jax.vmap(lambda one: jax.random.split(one, num_envs // len(bits)))(key).reshape(num_envs)
 
     def recorded(state: Any) -> tuple[Any, jax.Array]:
         fault = jnp.maximum(state.metrics["non_finite"], state.metrics["overflow"])
         flags = jnp.stack([state.done, state.info["truncation"], fault], axis=-1)
         return state, jnp.concatenate([state.obs, flags], axis=-1)
 
-    shapes = jax.eval_shape(lambda bits: vector.reset(key(bits)), jax.ShapeDtypeStruct((2,), jnp.uint32))
+    shapes = jax.eval_shape(lambda bits: vector.reset(keys(bits)), jax.ShapeDtypeStruct((1, 2), jnp.uint32))
     blank = jax.jit(lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
     return Program(env=env, blank=blank(), begin=jax.jit(begin), step=jax.jit(step))
 
@@ -337,8 +359,18 @@ def _like(leaf: jax.Array, array: np.ndarray) -> jax.Array:
     return jnp.asarray(array)
 
 
-def _bits(generator: np.random.Generator) -> np.ndarray:
-    return generator.integers(2**32, size=2, dtype=np.uint32)
+def _bits(generators: Sequence[np.random.Generator]) -> np.ndarray:
+    """64 random bits of each generator: uint32 [n, 2]."""
+    return np.stack([generator.integers(2**32, size=2, dtype=np.uint32) for generator in generators])
+
+
+def _seeded(seeds: list[Any], old: list[np.random.Generator] | None, num_envs: int) -> list[np.random.Generator]:
+    """A generator for each seed; where that is None the old one, if there is any."""
+    if len(seeds) != num_envs:
+        raise ValueError(f"seed is a list of {len(seeds)}; allowed: a whole number, or a list of {num_envs}")
+    if old is None:
+        old = [seeding.np_random()[0] for _ in seeds]
+    return [one if seed is None else seeding.np_random(seed)[0] for seed, one in zip(seeds, old, strict=True)]
 
 
 def _read(env: MazeEnv, array: jax.Array) -> Record:

@@ -27,6 +27,7 @@ from mujoco import rollout
 
 from envs._quiet import mjx
 from envs.common.batching import flattened
+from envs.common.errors import UserError
 from envs.options import EnvError
 
 CONTACTS = 24  # per environment; MJX-Warp pools them over the batch
@@ -81,7 +82,8 @@ class Physics:
     @cached_property
     def _step(self) -> StepBatch:
         with jax.ensure_compile_time_eval():  # the first use may be inside a function that is being traced
-            return flattened(_ENGINES[self.engine](self.model, self.frames))
+            step = _ENGINES[self.engine](self.model, self.frames)
+            return flattened(step if self.engine == "jax" else _without_derivatives(step, self.engine))
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """A simulation at rest in every respect but position [nq] and velocity [nv]; mocap bodies at their places."""
@@ -97,6 +99,17 @@ class Physics:
         """`dt` seconds under constant controls [nu]. A simulation that diverges turns non-finite, and remains so."""
         batch = self._step(*jax.tree.map(lambda leaf: leaf[None], (data, ctrl)))
         return jax.tree.map(lambda leaf: leaf[0], batch)
+
+
+def _without_derivatives(step: StepBatch, engine: str) -> StepBatch:
+    """`step`, which is no operation of JAX, and where a derivative is asked for a `UserError` in one line."""
+    told = jax.custom_jvp(step)
+
+    @told.defjvp
+    def derivative(primals: Any, tangents: Any) -> Any:
+        raise UserError(f'engine: "{engine}" has no derivatives; allowed: jax')
+
+    return told
 
 
 def resolve_engine(engine: str) -> str:

@@ -44,8 +44,12 @@ class VectorEnv:
         return partial(type(self), auto_reset=self.auto_reset), (self.env, self.num_envs)
 
     def reset(self, rng: jax.Array) -> State:
-        """New episodes [B] from one key, typed or raw."""
-        return self._begin(jax.random.split(rng, self.num_envs))
+        """New episodes [B] from one key, or from a key [B] for each; typed or raw.
+
+        Raises:
+          UserError: in one line, for another number of keys.
+        """
+        return self._begin(self._keys(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
         """One env step of every environment; `action` [B, action_size].
@@ -59,12 +63,24 @@ class VectorEnv:
         return self._step(state, action)
 
     def reset_where(self, state: State, mask: jax.Array, rng: jax.Array) -> State:
-        """New episodes where `mask` (bool [B]) is set; every other environment stays as it is, to the bit."""
-        return self._reset_where(state, mask, jax.random.split(rng, self.num_envs))
+        """New episodes where `mask` (bool [B]) is set; every other environment stays as it is, to the bit.
+
+        `rng` is as for `reset`.
+        """
+        return self._reset_where(state, mask, self._keys(rng))
 
     def with_goals(self, state: State, goals: jax.Array, mask: jax.Array) -> State:
         """`state` with the desired goals [B, k] where `mask` (bool [B]) is set, at the start of episodes."""
         return where(mask, jax.vmap(self.env.with_goal)(state, goals), state)
+
+    def _keys(self, rng: jax.Array) -> jax.Array:
+        """A key [B] for each environment: those given, or as many split from one."""
+        shape = jnp.shape(rng) if jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jnp.shape(rng)[:-1]
+        if shape == ():
+            return jax.random.split(rng, self.num_envs)
+        if shape != (self.num_envs,):
+            raise UserError(f"the shape of the keys is {shape}; allowed: one key, or ({self.num_envs},)")
+        return rng
 
     def _begin(self, rng: jax.Array) -> State:
         """New episodes, one for each key of `rng` [n]. Each keeps a key of its own for the resets to come."""
@@ -77,14 +93,25 @@ class VectorEnv:
         state = state.replace(info={**state.info, "final_obs": state.obs})
         if not self.auto_reset:
             return state
-        return jax.lax.cond((state.done > 0).any(), self._restart_done, lambda state: state, state)
+        return self._restart_done(state)
 
     def _restart_done(self, state: State) -> State:
         """New episodes where one has finished, with what is told of the finished step kept."""
-        fresh = self._begin(state.info["rng"])
+        rng = state.info["rng"]
+        # nothing in the `cond` depends on the action: JAX cannot differentiate it backward in a vmap
+        fresh = jax.lax.cond(
+            (state.done > 0).any(), self._begin, partial(_blank, jax.eval_shape(self._begin, rng)), rng
+        )
         kept = {key: state.info[key] for key in ("truncation", "final_obs")}
         fresh = fresh.replace(reward=state.reward, done=state.done, metrics=state.metrics, info={**fresh.info, **kept})
         return where(state.done > 0, fresh, state)
 
     def _reset_batch(self, state: State, mask: jax.Array, rng: jax.Array) -> State:
         return where(mask, self._begin(rng), state)
+
+
+def _blank(shapes: State, rng: jax.Array) -> State:
+    """A state of these shapes without any episode in it; its keys are `rng`."""
+    others = {key: leaf for key, leaf in shapes.info.items() if key != "rng"}
+    blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes.replace(info=others))
+    return blank.replace(info={**blank.info, "rng": rng})

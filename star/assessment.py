@@ -23,6 +23,7 @@ import numpy as np
 from rich.console import Console
 
 from envs import routes
+from envs.common import files
 from envs.vector import VectorEnv
 from star import checkpoint, evaluation, report
 from star import program as programs
@@ -401,6 +402,7 @@ def check_groups(groups: Mapping[str, Sequence[Path]], configs: Mapping[Path, Co
 
 def check_place(out: Path, *, force: bool) -> None:
     """Raise `UserError` if `write` could not write into the folder `out`, or would replace something there."""
+    files.check_name(out)
     above = next(path for path in (out, *out.absolute().parents) if path.exists())
     if not above.is_dir():
         raise ConfigError(f"--out: {out}: {above} is a file, not a folder")

@@ -10,7 +10,9 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -19,7 +21,7 @@ import yaml
 from rich.console import Console
 
 from envs.common import modes, reading
-from envs.common.errors import UserError
+from envs.common.errors import Notice, UserError
 from star.agent.sections import Config
 from star.config import plugins
 from star.config.run import TrainerConfig
@@ -88,7 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if ours:
         signal.signal(signal.SIGINT, at_once)
     try:
-        code = _run(sys.argv[1:] if arguments is None else list(arguments))
+        with _notices():
+            code = _run(sys.argv[1:] if arguments is None else list(arguments))
     except UserError as error:
         print(f"error: {_on_one_line(str(error))}", file=sys.stderr)
         code = 2
@@ -103,6 +106,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if ours:
             end(code)
     return leave(code)
+
+
+@contextmanager
+def _notices() -> Iterator[None]:
+    """Print every `Notice` in one line, and once; other warnings as ever."""
+    told: set[str] = set()
+
+    def show(message: Warning | str, *where: Any, **more: Any) -> None:
+        if not isinstance(message, Notice):
+            usual(message, *where, **more)
+        elif str(message) not in told:
+            told.add(str(message))
+            print(f"note: {_on_one_line(str(message))}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", Notice)
+        usual, warnings.showwarning = warnings.showwarning, show
+        yield
 
 
 def _on_one_line(message: str) -> str:
@@ -415,8 +436,8 @@ def _sweep(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     summary = sweep.run(found, out, storage=options.storage, quiet=options.quiet)
     Console().print(sweep_report.table(summary.rows, parameters=list(found.distributions), objective=found.objective))
     if not summary.finished:
-        again = [str(options.file), *(["--storage", "URL"] if options.storage else []), "--out", str(out)]
-        print(f"interrupted; running trials were given back; go on with: star sweep {' '.join(again)}")
+        again = ["sweep", str(options.file), *(["--storage", "URL"] if options.storage else []), "--out", str(out)]
+        print(f"interrupted; running trials were given back; go on with: star {shlex.join(again)}")
         return 130
     print(f"trials:  {out}/trials.csv")
     if summary.best is None:

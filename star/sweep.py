@@ -253,6 +253,7 @@ def run(
     Without a `storage` the database is `sweep.db` in `out`. A sweep that is there already goes on.
     Raises `UserError` for what cannot be used.
     """
+    files.check_name(out)
     database = out / "sweep.db"
     if storage is None and not database.exists() and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{out}: is not empty and holds no sweep.db to go on with; choose another --out")

@@ -17,8 +17,9 @@ import pytest
 
 import envs
 from envs.common.errors import UserError
-from star import cli
+from star import cli, sgim
 from star import program as programs
+from star.abstraction import regions
 from star.loading import parse
 from star.spec import Spec
 
@@ -145,11 +146,43 @@ def test_a_number_that_float32_makes_0_is_refused(number, tmp_path, capsys):
     assert "controller.ppo.learning_rate" in capsys.readouterr().err and not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("flag", ["--run-dir"])
-def test_a_folder_whose_name_is_not_utf8_is_refused_before_anything_is_made(flag, tmp_path, capsys):
-    name = os.fsdecode(os.fsencode(tmp_path) + b"/r\xff")
-    assert cli.main(["train", str(ROOT / "configs/point_maze.yaml"), flag, name]) == 2
-    assert "not UTF-8" in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["train", "configs/point_maze.yaml", "--run-dir", "{}"],
+        ["sweep", "configs/sweeps/three_values.yaml", "--out", "{}"],
+        ["evaluate", "{run}", "--out", "{}"],
+        ["record", "{run}", "--out", "{}.npz"],
+        ["report", "{run}", "--out", "{}.html"],
+        ["render", "point_maze", "--out", "{}.png"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_a_name_that_is_not_utf8_is_refused_before_anything_is_made(command, tmp_path, capsys):
+    name, run = os.fsdecode(os.fsencode(tmp_path) + b"/r\xff"), tmp_path / "run"
+    run.mkdir()
+    (run / "config.yaml").write_text("env: {name: point_maze}\n")
+    words = [str(ROOT / word) if word.startswith("configs") else word.format(name, run=run) for word in command]
+    assert cli.main(words) == 2
+    assert "not UTF-8" in capsys.readouterr().err and list(tmp_path.iterdir()) == [run]
+
+
+def test_cells_that_nobody_reaches_are_told_of_in_one_line_of_a_command(tmp_path, capsys):
+    sealed = "\n".join(["11111", "1r0g1", "11111", "11011", "11111"])
+    command = ["train", str(ROOT / "configs/point_maze.yaml"), "--env.options.map", sealed]
+    assert cli.main([*command, "--run-dir", str(tmp_path / "run"), "--abstraction.max_regions", "2"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["note", "error"] and "row 4, column 3" in lines[0]
+
+
+@pytest.mark.parametrize("mode", [jax.enable_x64(True), jax.numpy_dtype_promotion("strict")])
+def test_goal_selection_alone_refuses_the_modes_that_environments_refuse(mode):
+    bins = regions.create(([0.0], [3.0]), [[1.0, 2.0]], max_regions=8)
+    with mode:
+        with pytest.raises(UserError, match="JAX_"):
+            sgim.init(sgim.Config(), bins, costs=[1.0])
+        with pytest.raises(UserError, match="JAX_"):
+            regions.create(([0.0], [3.0]), [[1.0, 2.0]], max_regions=8)
 
 
 def test_printed_commands_can_be_typed(tmp_path):

@@ -29,6 +29,7 @@ def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
     """`function` of pytrees with a leading batch axis [n, ...], made to see a single such axis under any vmaps.
 
     A vmap over S calls it once with [S * n, ...], arguments that are not batched repeated, and returns [S, n, ...].
+    Derivatives, forward or backward, are those of `function` itself; vmaps around them nest.
     """
     inner = custom_vmap(_without_empty_constants(function))
 
@@ -42,7 +43,13 @@ def flattened(function: Callable[..., Any]) -> Callable[..., Any]:
         out = jax.tree.map(lambda leaf: leaf.reshape(axis_size, leaf.shape[0] // axis_size, *leaf.shape[1:]), out)
         return out, jax.tree.map(lambda _: True, out)
 
-    return inner
+    outer = jax.custom_jvp(inner)  # JAX cannot differentiate a `custom_vmap` backward
+
+    @outer.defjvp
+    def derivative(primals: Any, tangents: Any) -> Any:
+        return jax.jvp(function, primals, tangents)
+
+    return outer
 
 
 def shared_out(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -13,6 +13,10 @@ class UserError(ValueError):
     """
 
 
+class Notice(UserWarning):
+    """What a person should know though nothing is refused. The message is one line; the command line prints it."""
+
+
 def shown(value: Any, limit: int = 60) -> str:
     """A value that a user gave, as YAML spells it where Python would not, on one line and cut short."""
     if value is None or isinstance(value, bool):

@@ -22,6 +22,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from envs.common import modes
+
 
 class Abstraction(struct.PyTreeNode):
     """All regions of a run. R is the capacity, d the number of abstract dimensions."""
@@ -115,8 +117,10 @@ def create(space: tuple[ArrayLike, ArrayLike], cuts: Sequence[Sequence[float]], 
 
     Raises:
       ValueError: if the cuts are not increasing inside the space, or there are more boxes than `max_regions`.
+      UserError: if JAX is in a mode that nothing here runs in.
 
     """
+    modes.check()
     low, high = (np.asarray(corner, np.float32) for corner in space)
     if len(cuts) != len(low):
         raise ValueError(f"{len(cuts)} lists of cuts for {len(low)} abstract dimensions")

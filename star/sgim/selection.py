@@ -33,6 +33,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from envs.common import modes
 from star.abstraction.regions import Abstraction
 from star.sgim.sections import SelectionConfig
 
@@ -81,8 +82,10 @@ def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[floa
 
     Raises:
       ValueError: if there is no strategy, or a cost is not a positive number.
+      UserError: if JAX is in a mode that nothing here runs in.
 
     """
+    modes.check()
     price = np.asarray(costs, np.float32)
     if price.ndim != 1 or not len(price) or not (np.isfinite(price) & (price > 0)).all():
         raise ValueError(f"costs: {price.tolist()}; allowed: a list of positive numbers, one for each strategy")

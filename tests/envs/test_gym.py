@@ -319,6 +319,32 @@ def test_a_batch_with_the_same_seed_gives_the_same_episodes(name):
     assert not same(episode(first, 7), episode(first, 8))
 
 
+@pytest.mark.parametrize("kind", [list, tuple, np.array])
+def test_a_list_of_seeds_gives_each_environment_the_episodes_of_its_seed_alone(kind):
+    batch, one = make_vec(), make()
+    seeds, last = range(4, 4 + B), np.arange(B) == B - 1
+    first, _ = batch.reset(seed=kind(seeds))
+    again, _ = batch.reset(options={"reset_mask": last})
+    for seen, expected in ((first, one.reset(seed=3 + B)[0]), (again, one.reset()[0])):
+        np.testing.assert_equal({key: value[-1] for key, value in seen.items()}, expected)
+    kept, _ = batch.reset(seed=[None] * (B - 1) + [9])
+    np.testing.assert_equal({key: value[-1] for key, value in kept.items()}, one.reset(seed=9)[0])
+    one.reset(seed=4)
+    np.testing.assert_equal({key: value[0] for key, value in kept.items()}, one.reset()[0])
+    np.testing.assert_equal(batch.reset(seed=3)[0], batch.reset(seed=3)[0])
+
+
+@pytest.mark.parametrize("number", [0, 1, B + 1])
+def test_seeds_of_another_number_are_refused_in_one_line(number):
+    with pytest.raises(ValueError, match=rf"seed is a list of {number}; allowed: a whole number, or a list of {B}"):
+        make_vec().reset(seed=[1] * number)
+
+
+@pytest.mark.parametrize("built", [make, make_vec])
+def test_a_seed_may_be_a_number_of_numpy(built):
+    np.testing.assert_equal(built().reset(seed=np.int64(5))[0], built().reset(seed=5)[0])
+
+
 def test_an_environment_that_ends_begins_anew_within_the_step():
     vector = make_vec()
     steps = episode(vector, 0)

@@ -1,3 +1,5 @@
+import warnings
+
 import jax
 import numpy as np
 import pytest
@@ -6,7 +8,9 @@ from hypothesis import strategies as st
 
 import envs
 from envs import arena as arenas
-from envs.arena import Arena
+from envs.arena import Arena, unreached
+from envs.common.errors import Notice
+from envs.maze import sample
 from envs.tasks import TASKS
 
 OWN = """
@@ -125,3 +129,35 @@ def test_without_marked_goals_the_test_goal_is_the_longest_walk_away():
 @pytest.mark.parametrize("name", envs.names())
 def test_the_maps_of_all_tasks_are_sound(name):
     arenas.check(TASKS[name].arena, name=name)
+
+
+SEALED = """
+1111111
+1r00101
+1000101
+1111111
+"""
+
+
+@pytest.mark.parametrize("options", [{"goals": "train"}, {"goals": "test"}, {"start": "free"}])
+@pytest.mark.parametrize("name", ["point_maze", "ant_maze"])
+def test_cells_that_nobody_reaches_are_told_of_and_hold_neither_goals_nor_starts(name, options):
+    with pytest.warns(Notice, match=r"^map: 2 free cells cannot be reached .* row 2, column 6: taken for walls[^\n]*$"):
+        env = envs.make(name, map=SEALED, cell=4.0, **options)
+    assert env.arena.rows[1:3] == ("1r00111", "1000111")
+    np.testing.assert_array_equal(env.space[1], [10.0, 6.0])
+    keys = jax.random.split(jax.random.key(0), 200)
+    goals = jax.vmap(env.draw_goal)(keys)
+    starts = jax.vmap(lambda key: sample(env._starts, key))(keys)
+    assert (goals[:, 0] < 10).all() and (starts[:, 0] < 10).all()
+
+
+def test_a_map_whose_cells_are_all_reached_says_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert unreached(envs.make("point_maze", map=OWN).arena) == []
+
+
+def test_a_start_with_free_cells_behind_walls_alone_is_refused():
+    with pytest.raises(envs.EnvError, match="no free cell beside the start"):
+        envs.make("point_maze", map="11111\n1r101\n11111")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import envs
+from envs.common.errors import UserError
 from envs.maze import MazeEnv
 
 B = 4
@@ -160,3 +161,50 @@ def test_typed_keys_are_carried_like_raw_ones(env):
     typed, raw = (stepper(vector)(vector.reset(key), ended) for key in (jax.random.key(3), jax.random.PRNGKey(3)))
     np.testing.assert_array_equal(typed.done, np.ones(B))
     np.testing.assert_array_equal(typed.obs, raw.obs)
+
+
+def test_a_key_for_each_environment_begins_the_episode_of_that_environment_alone(env):
+    vector, single = envs.VectorEnv(env, B), envs.VectorEnv(env, 1)
+    keys = jax.random.split(jax.random.key(0), B)
+    np.testing.assert_array_equal(vector.reset(keys).obs, vector.reset(jax.random.key(0)).obs)
+    np.testing.assert_array_equal(vector.reset(jax.random.key_data(keys)).obs, vector.reset(keys).obs)
+    for i in range(B):
+        np.testing.assert_array_equal(vector.reset(keys).obs[i], single.reset(keys[i : i + 1]).obs[0])
+    state = vector.reset(jax.random.key(7))
+    mask = jnp.arange(B) == 2
+    np.testing.assert_array_equal(vector.reset_where(state, mask, keys).obs[2], vector.reset(keys).obs[2])
+    with pytest.raises(UserError, match=rf"the shape of the keys is \(2,\); allowed: one key, or \({B},\)"):
+        vector.reset(keys[:2])
+
+
+@pytest.mark.parametrize("auto_reset", [True, False])
+def test_the_derivative_of_a_batch_is_that_of_each_environment(env, auto_reset):
+    vector = envs.VectorEnv(env, B, auto_reset=auto_reset)
+    state, action = vector.reset(jax.random.key(0)), 0.5 * act(env)
+
+    def rewards(action):
+        return vector.step(state, action).reward
+
+    each = jax.vmap(jax.grad(lambda one, action: env.step(one, action).reward, argnums=1))(state, action)
+    assert (jnp.abs(each) > 0).any()
+    np.testing.assert_allclose(jax.jit(jax.grad(lambda a: rewards(a).sum()))(action), each, rtol=1e-5)
+    forward = jax.jacfwd(rewards)(action)
+    np.testing.assert_allclose(jnp.einsum("iij->ij", forward), each, rtol=1e-5)
+    pair = jnp.stack([action, action])
+    for nested in (
+        jax.vmap(jax.grad(lambda a: rewards(a).sum())),
+        jax.grad(lambda a: jax.vmap(rewards)(a).sum()),
+    ):
+        np.testing.assert_allclose(nested(pair), jnp.stack([each, each]), rtol=1e-5)
+
+
+def test_an_engine_without_derivatives_says_so_in_one_line():
+    env = envs.make("ant_maze", engine="native")
+    vector = envs.VectorEnv(env, 2)
+    state = vector.reset(jax.random.key(0))
+    for function in (
+        jax.grad(lambda a: vector.step(state, a).reward.sum()),
+        jax.jacfwd(lambda a: vector.step(state, a).obs),
+    ):
+        with pytest.raises(UserError, match='engine: "native" has no derivatives; allowed: jax'):
+            function(jnp.zeros((2, 8)))
