@@ -326,11 +326,12 @@ def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]
 
 
 def _value(text: str) -> Any:
-    """Numbers, lists and the like as YAML reads them; text that YAML does not read stays text."""
+    """Numbers, lists and the like as YAML reads them; what is no more than text stays as it was typed."""
     try:
-        return reading.plain(text)
+        value = reading.plain(text)
     except yaml.YAMLError:
         return text
+    return text if isinstance(value, str) and "\n" in text else value  # YAML would fold the lines of a map
 
 
 def _new(folder: Path, name: str) -> Path:
