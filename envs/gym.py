@@ -14,6 +14,7 @@ differ in the last bit from what `compute_reward` makes of the same goals.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -262,8 +263,23 @@ class GymVectorEnv(_Travels, gymnasium.vector.VectorEnv[Observation, np.ndarray,
         return tuple(_picture(self.maze, state, i, self._picture) for i in range(self.num_envs))
 
 
+_begun: list[int] = []  # the process that has compiled, and with it those forked from it
+
+
+def _check_process() -> None:
+    """Raise `EnvError` in a process that was forked from one in which JAX had begun: it would wait for ever."""
+    if not _begun:
+        _begun.append(os.getpid())
+    if _begun[0] != os.getpid():
+        raise envs.EnvError(
+            'this process was forked from one that runs JAX, and would hang; start it by "spawn" or "forkserver", as '
+            'AsyncVectorEnv does with context="forkserver", or make the batch with gymnasium.make_vec'
+        )
+
+
 def program(task: str, options: dict[str, Any], num_envs: int) -> Program:
     """The program of a batch, compiled at most once; raises `EnvError` if the options are wrong."""
+    _check_process()
     options = normal(options)
     arena = envs.make(task, **options).arena  # the file of a map may have changed
     return _compiled(task, arena, num_envs, **dict(sorted(options.items())))

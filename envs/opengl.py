@@ -6,9 +6,12 @@ chosen when the first picture is drawn, so that nobody has to set anything; `MUJ
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import sys
+import threading
+from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
@@ -16,18 +19,40 @@ from envs.options import EnvError
 
 BACKENDS = ("egl", "osmesa")
 UNDECIDED = ("", "1", "true", "on", "enable", "enabled")  # values of MUJOCO_GL that name no backend
+_DRAWING = threading.RLock()
 HELP = "on Debian and Ubuntu install libosmesa6, or libegl1 and libgl1"
 
 
 def new_context(width: int, height: int) -> Any:
-    """A context that is current, for pictures of `width` x `height`; its owner calls `free`.
+    """A context for pictures of `width` x `height`, to be used as `current`; its owner calls `free`.
 
     Raises:
       EnvError: in one line that says what to install, if this machine has no OpenGL without a window.
     """
-    context = backend()(width, height)
-    context.make_current()
-    return context
+    with _DRAWING:
+        return backend()(width, height)
+
+
+@contextlib.contextmanager
+def current(context: Any) -> Iterator[None]:
+    """Draw with `context`, in any thread: OpenGL lets one thread at a time have it, and keep it until it lets go."""
+    with _DRAWING:
+        context.make_current()
+        try:
+            yield
+        finally:
+            _let_go(context)
+
+
+def _let_go(context: Any) -> None:
+    """Have the thread's current context be none."""
+    module = sys.modules[type(context).__module__]
+    if module.__name__.endswith("egl"):
+        egl = module.EGL
+        egl.eglBindAPI(egl.EGL_OPENGL_API)  # of this thread; else it lets go of nothing
+        egl.eglMakeCurrent(module.EGL_DISPLAY, egl.EGL_NO_SURFACE, egl.EGL_NO_SURFACE, egl.EGL_NO_CONTEXT)
+    else:
+        module.osmesa.OSMesaMakeCurrent(None, None, module.GL.GL_FLOAT, 0, 0)
 
 
 @cache

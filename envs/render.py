@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import atexit
 import copy
+import threading
 from typing import Any, NamedTuple, Self
 
 import mujoco
@@ -102,9 +103,10 @@ class Painter:
         self._scene = mujoco.MjvScene(stage.model, maxgeom=MAX_GEOMS)
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = shadows > 0
         self._options = mujoco.MjvOption()
-        self._gl = mujoco.MjrContext(stage.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gl)
-        mujoco.mjr_resizeOffscreen(width, height, self._gl)
+        with opengl.current(self._context):
+            self._gl = mujoco.MjrContext(stage.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._gl)
+            mujoco.mjr_resizeOffscreen(width, height, self._gl)
         atexit.register(self.close)  # before the display that the context lives on is closed
 
     def __enter__(self) -> Self:
@@ -117,8 +119,8 @@ class Painter:
         """Give back what it holds; more than once is fine."""
         atexit.unregister(self.close)
         if self._context is not None:
-            self._context.make_current()
-            self._gl.free()
+            with opengl.current(self._context):
+                self._gl.free()
             self._context.free()
             self._context = None
 
@@ -126,7 +128,10 @@ class Painter:
         """The stage as it is now, from one of `CAMERAS`: uint8 [height, width, 3]."""
         if self._context is None:
             raise ValueError("this painter is closed")
-        self._context.make_current()
+        with opengl.current(self._context):
+            return self._painted(marks, camera)
+
+    def _painted(self, marks: Marks, camera: str) -> np.ndarray:
         stage, scene = self.stage, self._scene
         eye = _camera(stage, camera, self._width / self._height)
         mujoco.mjv_updateScene(
@@ -142,6 +147,7 @@ class Painter:
 
 
 _painters: dict[tuple[int, int, int], Painter] = {}
+_FRAMES = threading.Lock()  # of the painters above, which all threads share
 
 
 def frame(
@@ -152,14 +158,15 @@ def frame(
     Raises:
       EnvError: in one line, if the camera is unknown or this machine has no OpenGL without a window.
     """
-    key = (id(env), width, height)
-    if key not in _painters:
-        if len(_painters) >= 4:
-            _painters.pop(next(iter(_painters))).close()
-        _painters[key] = Painter(Stage(env), width=width, height=height)
-    painter = _painters[key]
-    painter.stage.place(*(np.asarray(part) for part in env.pose(data)))
-    return painter.paint(marks, camera=camera)
+    key, pose = (id(env), width, height), [np.asarray(part) for part in env.pose(data)]
+    with _FRAMES:
+        if key not in _painters:
+            if len(_painters) >= 4:
+                _painters.pop(next(iter(_painters))).close()
+            _painters[key] = Painter(Stage(env), width=width, height=height)
+        painter = _painters[key]
+        painter.stage.place(*pose)
+        return painter.paint(marks, camera=camera)
 
 
 def frame_of(arena: Arena) -> np.ndarray:

@@ -27,20 +27,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 
 from envs.common import files
 from star import devices, provenance
 from star import program as programs
+from star._quiet import ocp
 from star.agent.sections import Config
 from star.agent.state import TrainState, leaf_name
 from star.config.section import ConfigError
 from star.loading import fields, parse
 from star.migrations import FORMAT, About, Arrays, migrated, migrated_arrays, readable
-from star.program import Program
+from star.program import KEYS, Program
 
 SUMS = "SHA256SUMS"
 _ABOUT = "about.json"
+_MERGED = "manifest.ocdbt"  # of orbax, once all that was written is found
 _WRITING, _LEAVING = ".partial", ".removed"  # hidden folders that a process which was killed may leave
 _ASIDE = ".damaged"
 _M_MMAP_THRESHOLD = -3  # of glibc
@@ -87,6 +88,8 @@ class Checkpoints:
             with _memory_given_back():
                 self._open().save(writing.absolute() / "state", args=ocp.args.StandardSave(plain(state)))
             if devices.first():
+                if not (writing / "state" / _MERGED).exists():  # orbax would only have warned
+                    raise OSError(errno.EIO, "orbax has not put its parts together")
                 text = json.dumps(about | {"config": config.model_dump(mode="json")}, indent=1)
                 (writing / _ABOUT).write_text(text + "\n", encoding="utf-8")
                 (writing / SUMS).write_text(_sums(writing), encoding="utf-8")
@@ -353,7 +356,8 @@ def check_compatible(saved: Config, wanted: Config, *, source: Path) -> None:
 
 def differences(saved: Config, wanted: Config) -> Iterator[tuple[str, Any, Any]]:
     """(key, value in `saved`, value in `wanted`) of the settings that make them different runs."""
-    before, after = (config.model_dump(mode="json") for config in (saved, wanted))
+    unlike = {"sgim": {"teachers": {"__all__": {"sha256"}}}}  # is checked where the file is read
+    before, after = (config.model_dump(mode="json", exclude=unlike) for config in (saved, wanted))
     for key, default, _ in fields():
         if isinstance(default, float) or key.startswith(_HARMLESS):
             continue
@@ -449,4 +453,4 @@ def plain(state: TrainState) -> TrainState:
 
 
 def _with_keys(saved: Any, example: TrainState) -> TrainState:
-    return jax.tree.map(lambda x, like: jax.random.wrap_key_data(x) if _is_key(like) else x, saved, example)
+    return jax.tree.map(lambda x, like: jax.random.wrap_key_data(x, impl=KEYS) if _is_key(like) else x, saved, example)

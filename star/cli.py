@@ -12,7 +12,7 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import yaml
 from rich.console import Console
 
-from envs.common import modes, reading
+from envs.common import files, modes, reading
 from envs.common.errors import Notice, UserError
 from star.agent.sections import Config
 from star.config import plugins
@@ -28,6 +28,7 @@ from star.config.run import TrainerConfig
 from star.config.section import ConfigError
 from star.loading import fields, load, parse
 from star.stopping import at_once, end, leave
+from star.streams import unbroken
 
 if TYPE_CHECKING:
     from star.stretch import Result
@@ -89,23 +90,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ours = arguments is None  # the process is this command's
     if ours:
         signal.signal(signal.SIGINT, at_once)
+    with unbroken() as out:
+        code = _guarded(sys.argv[1:] if ours else list(arguments or []), ours=ours)
+        if out is not None:
+            out.flush()
+            if out.error is not None and not isinstance(out.error, BrokenPipeError):  # who reads no more wants no more
+                print(f"error: standard output cannot be written: {out.error.strerror}", file=sys.stderr)
+                code = code or 2
+    return leave(code)
+
+
+def _guarded(arguments: list[str], *, ours: bool) -> int:
+    """Run the command; what is wrong is said in one line."""
     try:
         with _notices():
-            code = _run(sys.argv[1:] if arguments is None else list(arguments))
+            return _run(arguments)
     except UserError as error:
         print(f"error: {_on_one_line(str(error))}", file=sys.stderr)
-        code = 2
+        return 2
     except (RuntimeError, AssertionError):
         line = modes.missing_device()
         if line is None:
             raise
         print(f"error: {line}", file=sys.stderr)
-        code = 2
+        return 2
     except KeyboardInterrupt:
-        code = 130
         if ours:
-            end(code)
-    return leave(code)
+            end(130)
+        return 130
 
 
 @contextmanager
@@ -335,10 +347,31 @@ def _value(text: str) -> Any:
 
 
 def _new(folder: Path, name: str) -> Path:
-    """A place in `folder` that is named after the time, and is not there yet."""
+    """A new place in `folder`, named after the time. It is made at once, so that no other command takes it."""
     first = folder / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
     places = itertools.chain([first], (first.with_name(f"{first.name}-{number}") for number in itertools.count(2)))
-    return next(place for place in places if not place.exists())
+    for place in places:
+        try:
+            files.check_name(place)
+            place.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ConfigError(f"{place}: cannot be written: {error.strerror}") from None
+        return place
+    raise AssertionError
+
+
+@contextmanager
+def _given_back(place: Path) -> Iterator[None]:
+    """If what is done here is refused, remove the new `place` for it, and the folder around, as far as empty."""
+    try:
+        yield
+    except UserError:
+        with suppress(OSError):
+            place.rmdir()
+            place.parent.rmdir()
+        raise
 
 
 def _natural(text: str) -> int:
@@ -364,12 +397,9 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
             raise ConfigError("--run-dir: a resumed run stays where it is")
         if options.layers:
             raise ConfigError("--with: a resumed run keeps its config file")
-        run_dir = options.resume
-        config = _run_config(run_dir, overrides)
+        config = _run_config(options.resume, overrides)
     else:
         config = load(options.config, overrides, layers=options.layers)
-        name = "-".join(file.stem for file in (options.config, *options.layers))
-        run_dir = options.run_dir or _new(Path("runs"), name)
 
     if options.debug:
         if config.sgim.enabled:
@@ -384,9 +414,12 @@ def _train(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         if options.resume is None and options.run_dir is None:
             raise ConfigError("--distributed: needs --run-dir, the same for all processes")
         devices.join(options.distributed)
-    result = trainer.train(
-        config, run_dir, resume=options.resume is not None, quiet=options.quiet, profile=options.profile
-    )
+    name = "-".join(file.stem for file in (options.config, *options.layers) if file)
+    run_dir = options.resume or options.run_dir or _new(Path("runs"), name)
+    with _given_back(run_dir):
+        result = trainer.train(
+            config, run_dir, resume=options.resume is not None, quiet=options.quiet, profile=options.profile
+        )
     if devices.first():
         _say_how_it_ended(result, config.trainer)
     if result.fault is not None:
@@ -434,7 +467,8 @@ def _sweep(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     # workers of one study find the same folder
     folder = Path("sweeps")
     out = options.out or (folder / found.name if options.storage else _new(folder, options.file.stem))
-    summary = sweep.run(found, out, storage=options.storage, quiet=options.quiet)
+    with _given_back(out):
+        summary = sweep.run(found, out, storage=options.storage, quiet=options.quiet)
     Console().print(sweep_report.table(summary.rows, parameters=list(found.distributions), objective=found.objective))
     if not summary.finished:
         again = ["sweep", str(options.file), *(["--storage", "URL"] if options.storage else []), "--out", str(out)]

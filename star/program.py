@@ -15,6 +15,7 @@ from jax.sharding import Mesh
 
 import envs
 from envs import arena
+from envs.common import files, modes, reading
 from envs.options import normal
 from envs.vector import VectorEnv
 from star import devices, faults, learners
@@ -33,6 +34,9 @@ from star.spec import Spec
 # Streams of random keys that no seed of training uses.
 DURING_TRAINING = 2**32 - 1
 AFTERWARDS = 2**32 - 2
+
+KEYS = "threefry2x32"
+"""The one kind of random keys that runs and checkpoints have, whatever kind JAX has been told to make."""
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,7 @@ class Program:
 def build(config: Config) -> Program:
     """Make the environments and the jitted functions of `config`; raises `UserError` if they cannot be made."""
     select_device(config.trainer.device)
+    modes.check_draws()
     env, test_env = (make_env(config, goals) for goals in ("train", "test"))
     spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
     config = resolve(config, env.engine, spec)
@@ -178,16 +183,27 @@ def select_device(device: str) -> None:
 
 
 def resolve(config: Config, engine: str, spec: Spec) -> Config:
-    """`config` with the engine, the map and the initial cuts that are really used."""
+    """`config` with the engine, the map, the initial cuts and the teachers' files that are really used."""
     values = config.model_dump(mode="json")
     values["env"]["engine"] = engine
     for key in ("options", "training"):
         options = values["env"][key] = normal(values["env"][key])
         if "map" in options:  # the run must not change with the file
             options["map"] = arena.load(options["map"])
+    for teacher in values["sgim"]["teachers"]:
+        teacher["sha256"] = teacher["sha256"] or _checksum(teacher["source"])
     if values["abstraction"]["cuts"] is None and values["abstraction"]["grid"] is None:
         values["abstraction"]["cuts"] = spec.region_cuts
     return parse(values)
+
+
+def _checksum(source: str) -> str | None:
+    """That of a teacher's file; None if there is none to read, which is told when its lessons are needed."""
+    try:
+        reading.check_regular(Path(source))
+        return files.sha256(Path(source))
+    except (OSError, ValueError):
+        return None
 
 
 def make_env(config: Config, goals: str, **others: Any) -> Any:
@@ -217,12 +233,16 @@ def seeds_of(config: Config) -> list[int]:
 
 def seed_keys(seeds: Sequence[int]) -> jax.Array:
     """Keys that the states of these seeds start from."""
-    return jax.vmap(jax.random.key)(np.asarray(seeds, np.uint32))
+    return jax.vmap(_key)(np.asarray(seeds, np.uint32))
+
+
+def _key(seed: Any) -> jax.Array:
+    return jax.random.key(seed, impl=KEYS)
 
 
 def evaluation_keys(seeds: Sequence[int], numbers: Sequence[int] | np.ndarray, *, stream: int) -> jax.Array:
     """Keys of one evaluation of each seed; `numbers` are those of `Program.evaluation_keys`."""
-    base, fold = jax.random.key(stream), jax.random.fold_in
+    base, fold = _key(stream), jax.random.fold_in
     return jax.vmap(lambda number, seed: fold(fold(base, number), seed))(
         np.asarray(numbers, np.uint32), np.asarray(seeds, np.uint32)
     )
@@ -262,7 +282,7 @@ def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: An
     if teacher.source == "map":
         demos = teachers.shortest_paths(env)
     else:
-        demos = teachers.load(Path(teacher.source), env=config.env.name, spec=spec)
+        demos = teachers.load(Path(teacher.source), env=config.env.name, spec=spec, sha256=teacher.sha256)
     if teacher.kind == "action" and demos.actions is None:
         raise ConfigError(f"sgim.teachers: {teacher.source} shows no actions; {teacher.name} cannot be of kind action")
     if teacher.flaw == "repetitive":
@@ -270,11 +290,11 @@ def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: An
     if teacher.flaw == "other_body":
         return teachers.other_body(demos)
     if teacher.flaw == "wrong_half":
-        return teachers.wrong_half(demos, spec.goal_point(tested.reset(jax.random.key(0)).obs))
+        return teachers.wrong_half(demos, spec.goal_point(tested.reset(_key(0)).obs))
     return demos
 
 
 def _a_goal(spec: Spec, env: Any) -> np.ndarray:
     """A goal that `env` draws, as an abstract point [d]; dimensions that goals leave open are 0."""
-    goal = env.draw_goal(jax.random.key(0))
+    goal = env.draw_goal(_key(0))
     return np.asarray(spec.goal_point(jax.numpy.concatenate([jax.numpy.zeros(spec.state_dim), goal])))

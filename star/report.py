@@ -281,8 +281,12 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def literal(text: str) -> str:
-    """What a user typed, for a figure: matplotlib would set what is between two $ as a formula, or fail to."""
-    return text.replace("$", r"\$")
+    """What a user typed, for a figure.
+
+    Matplotlib would set what is between two $ as a formula, or fail to, and leave a name that begins with _ out of
+    legends.
+    """
+    return " " * text.startswith("_") + text.replace("$", r"\$")
 
 
 def labels(runs: Sequence[Path]) -> list[str]:

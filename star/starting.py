@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +25,6 @@ _BEGUN = (lock.NAME, ".config-")  # of a run that was killed before its config.y
 
 def make(run_dir: Path) -> None:
     """Make the folder of a new run; what a process that was killed at once left there does no harm."""
-    files.check_name(run_dir)
     try:
         used = run_dir.is_dir() and any(not entry.name.startswith(_BEGUN) for entry in run_dir.iterdir())
         if used or (run_dir.exists() and not run_dir.is_dir()):
@@ -33,6 +34,13 @@ def make(run_dir: Path) -> None:
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{run_dir}: cannot be written: {error.strerror}") from None
+
+
+def check_name(run_dir: Path) -> None:
+    """Raise `UserError` for a folder that orbax takes for a pattern: checkpoints written there could not be read."""
+    files.check_name(run_dir)
+    if re.search(r"\[.*\]|\\", os.fspath(run_dir.absolute())):
+        raise ConfigError(f"{run_dir}: a run cannot be kept there; not allowed in the name, or above: [ with ], and \\")
 
 
 def note(run_dir: Path, config: Config) -> None:

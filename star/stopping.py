@@ -16,7 +16,7 @@ from typing import NoReturn, TypeVar
 T = TypeVar("T")
 
 GRACE_S = 5.0  # how long after SIGTERM the computation under way may take; the rest of 10 s is for the checkpoint
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last: its terminal was closed
 _POLL_S = 0.2  # a signal that another thread receives does not wake this one
 _THREAD = "star compute"
 
@@ -28,7 +28,8 @@ class Overdue(Exception):
 class Stop:
     """What signals have asked for.
 
-    Called, it tells whether the command is to stop; `terminated` whether it was SIGTERM, as of a cluster, that came.
+    Called, it tells whether the command is to stop; `terminated` whether nobody waits for it: SIGTERM, as of a
+    cluster, or SIGHUP came.
     While `patient` is set nothing is overdue.
     """
 
@@ -46,7 +47,7 @@ class Stop:
         """Take a signal; the second one raises `KeyboardInterrupt`."""
         if self():
             raise KeyboardInterrupt
-        self._since, self.terminated = time.monotonic(), number == signal.SIGTERM
+        self._since, self.terminated = time.monotonic(), number != signal.SIGINT
         self.on_first()
 
     def during(self, compute: Callable[[], T]) -> T:
@@ -77,9 +78,17 @@ class Stop:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[Stop]:
-    """Yields what tells whether Ctrl-C was pressed or SIGTERM came; the first of them calls its `on_first`."""
+    """Yields what tells whether Ctrl-C was pressed, SIGTERM or SIGHUP came; the first of them calls its `on_first`.
+
+    Signals that the process ignores, as under `nohup`, stay ignored. Outside of the main thread, where Python lets
+    nobody hear signals, they are the caller's.
+    """
     stop = Stop()
-    before = {number: signal.signal(number, stop.hear) for number in _SIGNALS}
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    heard = [number for number in _SIGNALS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+    before = {number: signal.signal(number, stop.hear) for number in heard}
     try:
         yield stop
     finally:

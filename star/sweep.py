@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self, get_args
+from urllib.parse import quote
 
 from optuna import pruners, samplers
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
@@ -259,7 +260,7 @@ def run(
         raise ConfigError(f"{out}: is not empty and holds no sweep.db to go on with; choose another --out")
     if storage is None:
         _make(out)
-    url = storage or f"sqlite:///{database.absolute()}"
+    url = storage or f"sqlite:///{quote(str(database.absolute()))}"
     with reachable(url):
         if storage is None:
             _check_alone(found, out, url)

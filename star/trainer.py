@@ -40,6 +40,7 @@ def train(
     What cannot be written, as on a full disk, raises `UserError`. Several processes (`devices.join`) call this alike,
     and only the first of them writes anything but its share of the checkpoints.
     """
+    starting.check_name(run_dir)
     sinks.check(config)
     program = programs.build(config)
     program.lessons()  # refused before anything is written

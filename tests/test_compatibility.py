@@ -3,25 +3,41 @@
 from __future__ import annotations
 
 import copy
+import errno
+import hashlib
+import io
 import os
 import pickle
+import signal
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from urllib.parse import quote
 
 import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import yaml
+from matplotlib import pyplot
+from rich.console import Console
 
 import envs
+from envs.common import reading
 from envs.common.errors import UserError
-from star import cli, sgim
+from star import cli, report, sgim
 from star import program as programs
 from star.abstraction import regions
+from star.checkpoint import differences
 from star.loading import parse
+from star.sgim import teachers
 from star.spec import Spec
+from star.stopping import interruptible
+from star.streams import unbroken
+from star.study import sqlalchemy_url
 
 ROOT = Path(__file__).parents[1]
 
@@ -197,3 +213,179 @@ def test_printed_commands_can_be_typed(tmp_path):
         text=True,
     )
     assert done.returncode == 2 and f"star train --resume '{tmp_path}/a b'" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("010", 10), ("08", 8), ("-007", -7), ("0x10", 16), ("0b11", 3), ("1_000", 1000), ("1e-4", 1e-4), (".5", 0.5)]
+    + [(text, text) for text in ("1:30", "1:30:00", "2024-01-02", "1.2.3", "e5", "1e", "0x", "-.")],
+)
+def test_numbers_are_those_that_people_mean(text, value, tmp_path):
+    found = reading.plain(text)
+    assert found == value and type(found) is type(value)
+    assert reading.plain(reading.written({"x": text}))["x"] == text
+    assert yaml.safe_load(reading.written({"x": text, "y": value})) == {"x": text, "y": value}
+
+
+def test_a_padded_seed_is_that_seed_and_a_time_is_no_number(tmp_path, capsys):
+    found, _ = cli.split_settings(["--trainer.seed", "010"]), None
+    assert parse({}, found[1]).trainer.seed == 10
+    command = ["train", str(ROOT / "configs/point_maze.yaml"), "--run-dir", str(tmp_path / "run")]
+    assert cli.main([*command, "--total-env-steps", "1:30:00"]) == 2
+    assert "trainer.total_env_steps: '1:30:00'" in capsys.readouterr().err
+
+
+class Gone(io.StringIO):
+    """A stream whose other end is gone."""
+
+    encoding = "utf-8"
+
+    def write(self, text):
+        raise OSError(errno.EIO, "Input/output error")
+
+
+def test_a_command_goes_on_when_nobody_sees_its_output(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Gone())
+    monkeypatch.setattr(sys, "stdout", Gone())
+    with unbroken() as out:
+        Console(stderr=True).print("progress")
+        print("result")
+    assert out.error.errno == errno.EIO and isinstance(sys.stdout, Gone)
+
+
+def test_letters_that_a_stream_lacks_are_written_as_escapes(monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", stream)
+    with unbroken():
+        print("\N{GREEK SMALL LETTER ALPHA}!")
+    assert stream.buffer.getvalue() == b"\\u03b1!\n"
+
+
+@pytest.mark.parametrize(("place", "code"), [("/dev/full", 2), ("pipe", 0)])
+def test_a_list_that_nobody_reads_ends_well_and_one_that_cannot_be_written_is_told(place, code):
+    reads, writes = os.pipe()
+    os.close(reads)
+    command, environment = [sys.executable, "-m", "star", "settings"], os.environ | {"PYTHONPATH": str(ROOT)}
+    with open(place, "wb") if code else os.fdopen(writes, "wb") as out:
+        done = subprocess.run(command, env=environment, stdout=out, stderr=subprocess.PIPE, text=True)
+    expected = "error: standard output cannot be written: No space left on device\n" if code else ""
+    assert (done.returncode, done.stderr) == (code, expected)
+
+
+def test_signals_are_the_callers_outside_of_the_main_thread():
+    found = []
+
+    def work():
+        with interruptible() as stop:
+            found.append(stop())
+
+    before = signal.getsignal(signal.SIGINT)
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found == [False] and signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_closed_terminal_stops_a_run_as_sigterm_does_unless_it_is_ignored():
+    with interruptible() as stop:
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert stop() and stop.terminated
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interruptible() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.parametrize("name", ["lr=[1e-3]", "a\\b"])
+def test_a_folder_that_orbax_takes_for_a_pattern_is_refused(name, tmp_path, capsys):
+    command = ["train", str(ROOT / "configs/point_maze.yaml"), "--run-dir", str(tmp_path / name / "run")]
+    assert cli.main(command) == 2
+    assert "a run cannot be kept there" in capsys.readouterr().err and list(tmp_path.iterdir()) == []
+
+
+def test_two_commands_in_one_second_get_a_place_each(tmp_path):
+    places = {cli._new(tmp_path / "runs", "maze") for _ in range(3)}
+    assert len(places) == 3 and all(place.is_dir() for place in places)
+
+
+def test_what_is_refused_leaves_no_place_behind(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    command = ["train", str(ROOT / "configs/point_maze.yaml"), "--abstraction.max_regions", "2"]
+    assert cli.main(command) == 2 and capsys.readouterr().err.count("\n") == 1
+    assert list((tmp_path / "runs").iterdir() if (tmp_path / "runs").exists() else []) == []
+
+
+def test_a_run_knows_its_teachers_file_by_its_checksum(tmp_path):
+    source = tmp_path / "demos.npz"
+    source.write_bytes(b"1")
+    teacher = {"name": "expert", "kind": "decomposition", "source": str(source)}
+    config = parse({"sgim": {"teachers": [teacher]}})
+    resolved = programs.resolve(config, "jax", Spec.of(programs.make_env(config, "test")))
+    noted = resolved.sgim.teachers[0].sha256
+    assert noted == hashlib.sha256(b"1").hexdigest()
+    before = resolved.model_dump(mode="json")
+    before["sgim"]["teachers"][0]["sha256"] = None  # as in runs from before
+    assert list(differences(parse(before), resolved)) == []
+    np.savez(source, format=np.int32(1))
+    with pytest.raises(UserError, match=f"is not the file that the run began with; its SHA-256 was {noted}"):
+        teachers.load(source, env="point_maze", spec=Spec.of(programs.make_env(config, "test")), sha256=noted)
+
+
+@pytest.mark.parametrize("kind", ["rbg", "unsafe_rbg"])
+def test_runs_draw_the_same_whatever_keys_jax_makes(kind):
+    expected = jax.random.key_data(programs.seed_keys([3])), programs.evaluation_keys([3], [1], stream=2)
+    with jax.default_prng_impl(kind):
+        found = jax.random.key_data(programs.seed_keys([3])), programs.evaluation_keys([3], [1], stream=2)
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_array_equal(*(jax.random.key_data(keys[1]) for keys in (found, expected)))
+
+
+def test_a_run_refuses_to_draw_other_numbers_than_it_did():
+    with jax.threefry_partitionable(False), pytest.raises(UserError, match="^JAX_THREEFRY_PARTITIONABLE: is off"):
+        programs.build(parse({}))
+
+
+def test_a_name_with_an_underscore_in_front_is_in_the_legend():
+    _, axis = pyplot.subplots()
+    axis.plot([0], label=report.literal("_baseline"))
+    assert [text.get_text().strip() for text in axis.legend().get_texts()] == ["_baseline"]
+
+
+def test_pictures_may_be_drawn_in_any_thread(can_draw):
+    env = gymnasium.make("star/PointMaze-v0", render_mode="rgb_array", width=32, height=32)
+    env.reset(seed=0)
+    here = env.render()
+    with ThreadPoolExecutor(3) as pool:
+        others = list(pool.map(lambda _: env.render(), range(6)))
+    for other in [*others, env.render()]:
+        np.testing.assert_array_equal(other, here)
+
+
+def test_a_process_forked_from_one_that_runs_jax_is_told_so_instead_of_hanging():
+    gymnasium.make("star/PointMaze-v0")
+    with pytest.warns(RuntimeWarning, match="fork"):
+        child = os.fork()
+    if child == 0:  # nothing of pytest may go on here
+        try:
+            gymnasium.make("star/PointMaze-v0")
+        except envs.EnvError as error:
+            os._exit(7 if "forked" in str(error) else 8)
+        finally:
+            os._exit(9)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+
+
+@pytest.mark.parametrize("name", ["what?next", "a%20b", "x#y", "d b"])
+def test_a_sweep_keeps_its_database_in_a_folder_of_any_name(name, tmp_path):
+    folder = tmp_path / name
+    folder.mkdir()
+    url = f"sqlite:///{quote(str(folder / 'sweep.db'))}"
+    assert sqlalchemy_url(url).database == str(folder / "sweep.db")
+
+
+def test_what_is_imported_leaves_the_loggers_of_the_user_alone():
+    words = "import logging, star.trainer, star.checkpoint, envs.gym; assert logging.root.handlers == []"
+    subprocess.run([sys.executable, "-c", words], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)

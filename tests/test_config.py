@@ -94,7 +94,12 @@ def test_a_key_like_no_other_lists_those_of_its_section(write):
         ("tutor:", "tutor", "null", "a mapping such as {key: value}"),
         ("env: {options: fast}", "env.options", "'fast'", "a mapping such as"),
         ("env: {options: {goals: !!binary /w==}}", "env.options", "b'\\xff'", "text, a number"),
-        ("env: {training: {cell: [2020-01-01]}}", "env.training", "datetime.date(2020, 1, 1)", "text, a number"),
+        (
+            "env: {training: {cell: [!!timestamp 2020-01-01]}}",
+            "env.training",
+            "datetime.date(2020, 1, 1)",
+            "text, a number",
+        ),
     ],
 )
 def test_a_wrong_type_names_key_value_and_what_is_allowed(write, text, key, value, allowed):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import hashlib
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -54,6 +55,12 @@ def whole(path: Path) -> Iterator[Path]:
             sync(path.parent)
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def sha256(path: Path) -> str:
+    """The checksum of a file, as `sha256sum` prints it; raises `OSError`."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def sync(path: Path) -> None:

@@ -19,6 +19,13 @@ def check() -> None:
         raise UserError("JAX_NUMPY_DTYPE_PROMOTION: is strict; allowed: standard")
 
 
+def check_draws() -> None:
+    """Raise `UserError` in one line if JAX would draw other numbers from the same keys than a run did."""
+    config: Any = jax.config
+    if not config.jax_threefry_partitionable:
+        raise UserError("JAX_THREEFRY_PARTITIONABLE: is off, which changes what is drawn; allowed: on")
+
+
 def missing_device() -> str | None:
     """The line for a person, if JAX has none of the devices that JAX_PLATFORMS names; None if it has one."""
     try:

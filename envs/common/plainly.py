@@ -10,9 +10,12 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """`value` with Python's numbers for NumPy's, text for paths, and lists for arrays and tuples; all else as it is."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
+    """`value` with Python's numbers for those of NumPy and JAX, text for paths, lists for arrays and tuples.
+
+    All else stays as it is.
+    """
+    if hasattr(value, "__array__"):
+        return np.asarray(value).tolist()
     if isinstance(value, PurePath):
         return str(value)
     if isinstance(value, Mapping):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import stat
 from pathlib import Path
 from typing import Any
@@ -41,7 +42,9 @@ def text(path: Path) -> str:
 
 
 def plain(text: str) -> Any:
-    """What the YAML document `text` says: dictionaries, lists, text, numbers, dates and bytes.
+    """What the YAML document `text` says: dictionaries, lists, text, numbers and bytes.
+
+    Numbers are those of YAML 1.2: `010` is ten and `1e-4` is a number, `1:30` and `2024-01-02` are text.
 
     Raises:
       yaml.YAMLError: also for a key given twice, and for what is nested too deep or grows too large by its aliases.
@@ -80,6 +83,35 @@ class _Plain(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
+_INTEGER = ("tag:yaml.org,2002:int", re.compile(r"[-+]?(?:0b[01_]+|0o[0-7_]+|0x[0-9a-fA-F_]+|[0-9][0-9_]*)$"))
+_FLOAT = (
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"[-+]?(?:(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|\.(?:nan|NaN|NAN)$"
+    ),
+)
+_OLD = (_INTEGER[0], _FLOAT[0], "tag:yaml.org,2002:timestamp")
+_Plain.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in _OLD]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _tag, _pattern in (_INTEGER, _FLOAT):
+    _Plain.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
+
+
+class _Writer(yaml.SafeDumper):
+    """Puts quotes around text that any version of YAML would read as something else."""
+
+
+for _tag, _pattern in (_INTEGER, _FLOAT):
+    _Writer.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
+
+
+def written(values: Any) -> str:
+    """Dictionaries, lists, text and numbers as a YAML document, which `plain` reads."""
+    return yaml.dump(values, Dumper=_Writer, sort_keys=False)
+
+
 def _measure(node: yaml.Node, known: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
     """(nodes, depth) of `node` with its aliases written out; `known` are those of other nodes, None of those above."""
     if id(node) in known:
@@ -99,6 +131,14 @@ def _measure(node: yaml.Node, known: dict[int, tuple[int, int] | None]) -> tuple
         raise _error(f"more than {MAX_NODES:,} values, aliases written out", node.start_mark)
     known[id(node)] = count, depth
     return count, depth
+
+
+def _whole(loader: _Plain, node: yaml.ScalarNode) -> int:
+    digits = str(loader.construct_scalar(node)).replace("_", "")
+    return int(digits) if digits.lstrip("+-").isdecimal() else int(digits, 0)
+
+
+_Plain.add_constructor(_INTEGER[0], _whole)
 
 
 def _error(problem: str, mark: Any = None) -> yaml.YAMLError:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Annotated, Literal, Self
 
-import yaml
 from pydantic import Field, model_validator
 
+from envs.common import reading
 from star.abstraction.sections import AbstractionConfig, ForwardModelConfig, RefinementConfig
 from star.config.run import EnvConfig, TrainerConfig
 from star.config.section import Batch, Hidden, Positive, Repeats, Section
@@ -197,7 +197,7 @@ class Config(Section):
 
     def to_yaml(self) -> str:
         """Every resolved value as YAML that `star.loading.load` accepts."""
-        return yaml.safe_dump(self.model_dump(mode="json"), sort_keys=False)
+        return reading.written(self.model_dump(mode="json"))
 
 
 class AgentConfig(Section):

@@ -60,6 +60,9 @@ class TeacherConfig(Section):
         description="what is shown: movements to imitate, outcomes to aim at, or routes to a goal"
     )
     source: str = Field("map", description="file of demonstrations (.npz), or map: shortest paths, routes only")
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(
+        None, description="of that file; a run notes it, and goes on with no other file"
+    )
     flaw: Literal["repetitive", "wrong_half", "other_body"] | None = Field(
         None, description="what makes it a poor teacher, for experiments"
     )

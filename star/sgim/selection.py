@@ -224,7 +224,8 @@ def _distributions(
 
 def _sharpened(config: SelectionConfig, worth: Float[Array, "*n K"]) -> Float[Array, "*n K"]:
     """`worth` to the power of `sharpness`, in units of the largest on the last axis; 0 stays 0."""
-    return (worth / jnp.maximum(worth.max(axis=-1, keepdims=True), 1e-30)) ** config.sharpness
+    largest = worth.max(axis=-1, keepdims=True)
+    return (worth / jnp.where(largest > 0, largest, 1.0)) ** config.sharpness
 
 
 def _mixture(

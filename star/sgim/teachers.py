@@ -150,13 +150,16 @@ def check_place(path: Path, *, force: bool = False) -> None:
     files.check(path, ENDINGS, force=force)
 
 
-def load(path: Path, *, env: str, spec: Spec) -> Demonstrations:
+def load(path: Path, *, env: str, spec: Spec, sha256: str | None = None) -> Demonstrations:
     """Read demonstrations for the task named `env`.
 
     Raises:
-      UserError: in one line, if there is no such file, or it is malformed, or made for something else.
+      UserError: in one line, if there is no such file, it is malformed, made for something else, or has another
+        checksum than `sha256`.
     """
     arrays = _read(path)
+    if sha256 is not None and files.sha256(path) != sha256:
+        raise ConfigError(f"{path}: is not the file that the run began with; its SHA-256 was {sha256}")
     try:
         _check_about(arrays.pop("format", None), arrays.pop("env", None), env)
         _check_names(arrays)
