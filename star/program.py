@@ -112,7 +112,7 @@ class Program:
 def build(config: Config) -> Program:
     """Make the environments and the jitted functions of `config`; raises `UserError` if they cannot be made."""
     select_device(config.trainer.device)
-    modes.check_draws()
+    modes.check_training()
     env, test_env = (make_env(config, goals) for goals in ("train", "test"))
     spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
     config = resolve(config, env.engine, spec)

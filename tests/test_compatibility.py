@@ -389,3 +389,8 @@ def test_a_sweep_keeps_its_database_in_a_folder_of_any_name(name, tmp_path):
 def test_what_is_imported_leaves_the_loggers_of_the_user_alone():
     words = "import logging, star.trainer, star.checkpoint, envs.gym; assert logging.root.handlers == []"
     subprocess.run([sys.executable, "-c", words], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
+
+
+def test_a_run_refuses_to_stop_at_what_is_infinite_by_design():
+    with jax.debug_infs(True), pytest.raises(UserError, match="^JAX_DEBUG_INFS: is on"):
+        programs.build(parse({}))

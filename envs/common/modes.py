@@ -19,11 +19,13 @@ def check() -> None:
         raise UserError("JAX_NUMPY_DTYPE_PROMOTION: is strict; allowed: standard")
 
 
-def check_draws() -> None:
-    """Raise `UserError` in one line if JAX would draw other numbers from the same keys than a run did."""
+def check_training() -> None:
+    """Raise `UserError` in one line that names a mode in which no run can be trained, or go on as it was."""
     config: Any = jax.config
     if not config.jax_threefry_partitionable:
         raise UserError("JAX_THREEFRY_PARTITIONABLE: is off, which changes what is drawn; allowed: on")
+    if config.jax_debug_infs:
+        raise UserError("JAX_DEBUG_INFS: is on; what is not known yet is infinite here: switch it off")
 
 
 def missing_device() -> str | None:
