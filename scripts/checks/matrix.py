@@ -53,7 +53,6 @@ MODES: Mapping[str, tuple[Mapping[str, str], Sequence[str]]] = {
     "`JAX_PLATFORMS=cpu`": ({"JAX_PLATFORMS": "cpu"}, ()),
     "`JAX_PLATFORMS=abacus`": ({"JAX_PLATFORMS": "abacus"}, ()),
     "`python -O`": ({}, ("-O",)),
-    "`python -W error`": ({}, ("-W", "error")),
 }
 TRAINED: dict[str, Any] = {
     "env": {"name": "point_maze", "options": {"episode_length": 40}},
