@@ -1,5 +1,6 @@
 """What all tests share: JAX on the CPU, compiled quickly, and a tiny hierarchy, recorded step by step."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -32,8 +33,13 @@ from star import program as programs  # noqa: E402
 from star.agent import commander, controller, levels, play, tutor  # noqa: E402
 from star.agent.decisions import Roadmap  # noqa: E402
 from star.checkpoint import Checkpoints  # noqa: E402
+from star.config.run import TrainerConfig  # noqa: E402
 from star.spec import Spec  # noqa: E402
 from tests.browser import program, started
+
+# What is imported and traced stays: to look through it for garbage again and again is a tenth of all time.
+gc.freeze()
+gc.set_threshold(20_000, 20, 100)
 
 settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
 settings.load_profile("star")
@@ -105,6 +111,40 @@ LONGEST = ("test_trainer.py", "test_epoch.py", "test_strategies.py")
 def pytest_collection_modifyitems(items):
     """The files that take longest come first, so that both workers end at the same time."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled_once():
+    """Compiling takes most of the time of tests, and a program has no state: configs of one structure share it."""
+    build, known = programs.build, {}
+
+    def shared(config):
+        if reads_files(config):
+            return build(config)
+        key = compiled(config)
+        if key not in known:
+            known[key] = build(config)
+        program = known[key]
+        resolved = programs.resolve(config, program.config.env.engine, program.spec)
+        return replace(program, config=resolved, agent=resolved.agent())
+
+    programs.build = shared
+    yield
+    programs.build = build
+
+
+def reads_files(config):
+    """Whether a program of `config` depends on files, which may change: maps, demonstrations, learners of a user."""
+    maps = "map" in config.env.options | config.env.training
+    learners = any(":" in level.learner for _, level, _ in config.learners())
+    return maps or learners or any(teacher.source != "map" for teacher in config.sgim.teachers)
+
+
+def compiled(config):
+    """The structure of `config`, whatever the loop around its program does."""
+    names = ("num_envs", "eval_episodes", "device", "devices")
+    trainer = TrainerConfig(**{name: getattr(config.trainer, name) for name in names})
+    return programs.structure(config.model_copy(update={"trainer": trainer}))
 
 
 @pytest.fixture(scope="session")

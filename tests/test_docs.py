@@ -1,4 +1,3 @@
-import dataclasses
 import importlib
 import itertools
 import json
@@ -21,7 +20,6 @@ from star.agent.sections import Config
 from star.cli import main
 from star.loading import fields, load, parse
 
-ENDLESS = {"total_env_steps": 2**62}
 ROOT = Path(__file__).parents[1]
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("docs/*.md"))}
 PAGES["README.md"] = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -134,16 +132,6 @@ def test_the_commands_of_the_tutorial_work_as_they_are_but_smaller(run, tmp_path
     shutil.copytree(run, tmp_path / "runs" / "quickstart")  # of step 1
     for name, text in files("docs/tutorial.md").items():
         (tmp_path / name).write_text(text)
-    build, known = programs.build, {}
-
-    def shared(config):
-        """What trains, goes on and is evaluated is the same program: it is compiled once."""
-        endless = config.model_copy(update={"trainer": config.trainer.model_copy(update=ENDLESS)})
-        program = known.setdefault(programs.structure(endless), build(config))
-        resolved = programs.resolve(config, program.config.env.engine, program.spec)
-        return dataclasses.replace(program, config=resolved, agent=resolved.agent())
-
-    monkeypatch.setattr(programs, "build", shared)
     try:
         opengl.backend()
         drawn = ()

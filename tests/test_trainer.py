@@ -63,24 +63,6 @@ def saved_state(config, run_dir):
     return jax.tree.map(np.asarray, state.replace(key=jax.random.key_data(state.key)))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def compiled_once():
-    """Compiling takes nearly all the time of these tests, and a program has no state: configs of a structure share."""
-    build, known = programs.build, {}
-
-    def shared(config):
-        key = programs.structure(config)
-        if key not in known:
-            known[key] = build(config)
-        program = known[key]
-        resolved = programs.resolve(config, program.config.env.engine, program.spec)
-        return dataclasses.replace(program, config=resolved, agent=resolved.agent())
-
-    programs.build = shared
-    yield
-    programs.build = build
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """A run of four epochs and two seeds that was never interrupted."""
