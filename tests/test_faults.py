@@ -33,6 +33,7 @@ ALL_LEVELS = parse(
         "env.options": {"episode_length": 60},
         "tutor.learner": "td3",
         "tutor.td3": TD3,
+        "refinement.enabled": False,  # it learns nothing that could be lost
         "tutor.adjacency": {"enabled": True, "hidden": [8], "cell": 4, "batch_size": 8, "updates_per_epoch": 1},
     },
 )
@@ -161,7 +162,7 @@ class Rehearsal:
 
         def rehearsed(config):
             program = build(config)
-            return replace(program, functions=Functions(_initial(program), self.epoch, _nothing))
+            return replace(program, functions=Functions(program.functions.init, self.epoch, _nothing))
 
         monkeypatch.setattr(programs, "build", rehearsed)
 
@@ -195,13 +196,6 @@ class Rehearsal:
 
     def journal(self, name):
         return getattr(Journal.of(self.run_dir), name).read()
-
-
-_INITIAL = {}
-
-
-def _initial(program):
-    return _INITIAL.setdefault(programs.structure(program.config), jax.jit(program.functions.init))
 
 
 def _nothing(agent, state, keys):

@@ -343,14 +343,15 @@ def test_the_study_of_another_sweep_is_refused(folder):
 
 
 WORKERS = """
-import os, sys
+import os, pickle, sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
-from star.sweep import open_ledger, plan, work
+from star.sweep import open_ledger, work
 from test_sweep import Stub
 
+found = pickle.loads(Path("plan").read_bytes())
+
 def worker():
-    found = plan(Path("three.yaml"))
     ledger = open_ledger(found, sys.argv[1], beat_s=1, grace_s=3)
     return 0 if work(found, ledger, make=lambda config, slots: Stub(config, slots, wait_s=0.15)) else 1
 
@@ -369,7 +370,9 @@ def shared(url, *, workers):
     """Let workers share 8 trials and kill one in the middle of its own: the ledger, and the name of that one."""
     parameters = {"controller.ppo.learning_rate": {"low": 1e-4, "high": 1e-2}}
     path = written(sampler="random", parameters=parameters, trials=8, batch=2)
-    ledger = open_ledger(plan(path), url)
+    found = plan(path)
+    Path("plan").write_bytes(pickle.dumps(found))  # planning builds a program, which takes long
+    ledger = open_ledger(found, url)
     where = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     command = [sys.executable, "-c", WORKERS.format(tests=str(ROOT / "tests")), url, str(workers)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | where) as process:

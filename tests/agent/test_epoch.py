@@ -322,20 +322,24 @@ def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tin
 
 
 ADJACENCY = {"enabled": True, "hidden": [8], "batch_size": 8, "updates_per_epoch": 2}
-LEVELS = {
-    "gara": {"tutor.enabled": False},
-    "hrac": {"commander.enabled": False, "tutor.adjacency": ADJACENCY},
-}
 
 
-@pytest.mark.parametrize("name", LEVELS)
-def test_levels_can_be_left_out(breaking_env, turning, tiny, name):
-    """HRAC is HIRO with a loss more, here with subgoals that set a heading, of which adjacency knows nothing.
+@pytest.fixture(scope="module")
+def gara(breaking_env, tiny):
+    return Epoch(breaking_env, loading.parse(tiny, {"tutor.enabled": False}).model_dump(mode="json"))
 
-    Both levels are left out in `test_trainer.py`.
-    """
-    values = loading.parse(tiny, LEVELS[name]).model_dump(mode="json")
-    agent = Epoch(breaking_env, values, turning if name == "hrac" else None)
+
+@pytest.fixture(scope="module")
+def hrac(breaking_env, turning, tiny):
+    """HIRO with a loss more, here with subgoals that set a heading, of which adjacency knows nothing."""
+    values = loading.parse(tiny, {"commander.enabled": False, "tutor.adjacency": ADJACENCY})
+    return Epoch(breaking_env, values.model_dump(mode="json"), turning)
+
+
+@pytest.mark.parametrize("name", ["gara", "hrac"])
+def test_levels_can_be_left_out(request, name):
+    """Both levels are left out in `test_trainer.py`."""
+    agent = request.getfixturevalue(name)
     start = agent.init(jax.random.key(0))
     end, metrics = agent.one(agent.config.agent(), start)
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), start.controller.params, end.controller.params)
@@ -395,17 +399,16 @@ def test_a_termination_costs_its_penalty(recording):
     assert passed.terminated.any()
 
 
-def test_an_epoch_charges_for_tilts_by_the_env_steps_before_it(breaking_env, turning, tiny):
-    env_steps = turning.episode_length * B  # in an epoch
-    rising = {"tilt_penalty": 100.0, "tilt_start": 0.01, "tilt_steps": 2 * env_steps}
-    values = loading.parse(tiny, {"commander.enabled": False, "controller": tiny["controller"] | rising})
-    agent = Epoch(breaking_env, values.model_dump(mode="json"), turning)
-    start = agent.init(jax.random.key(0))
+def test_an_epoch_charges_for_tilts_by_the_env_steps_before_it(hrac):
+    env_steps = hrac.spec.episode_length * B  # in an epoch
+    rising = {"tilt_penalty": 100.0, "tilt_start": 0.01, "tilt_steps": 2.0 * env_steps}
+    values = loading.parse(hrac.config.model_dump(mode="json"), {f"controller.{key}": x for key, x in rising.items()})
+    start = hrac.init(jax.random.key(0))
     first, middle, last = (
-        float(agent.one(values.agent(), start.replace(epoch=start.epoch + done))[1]["controller/reward"])
+        float(hrac.one(values.agent(), start.replace(epoch=start.epoch + done))[1]["controller/reward"])
         for done in (0, 1, 2)
     )
-    assert agent.traces == 1
+    assert hrac.traces == 1
     assert first - last > 1
     assert (first - middle) / (first - last) == pytest.approx((0.1 - 0.01) / (1 - 0.01), rel=0.2)
 
