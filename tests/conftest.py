@@ -25,7 +25,7 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 import envs  # noqa: E402
-from envs import opengl  # noqa: E402
+from envs import arena, opengl  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
 from star import loading  # noqa: E402
@@ -131,9 +131,9 @@ def compiled_once():
     build, known = programs.build, {}
 
     def shared(config):
-        if reads_files(config):
-            return build(config)
         key = compiled(config)
+        if key is None:
+            return build(config)
         if key not in known:
             known[key] = build(config)
         program = known[key]
@@ -145,18 +145,23 @@ def compiled_once():
     programs.build = build
 
 
-def reads_files(config):
-    """Whether a program of `config` depends on files, which may change: maps, demonstrations, learners of a user."""
-    maps = "map" in config.env.options | config.env.training
-    learners = any(":" in level.learner for _, level, _ in config.learners())
-    return maps or learners or any(teacher.source != "map" for teacher in config.sgim.teachers)
-
-
 def compiled(config):
-    """The structure of `config`, whatever the loop around its program does."""
+    """The structure of `config`, whatever the loop around its program does; None if it depends on files."""
+    learners = any(":" in level.learner for _, level, _ in config.learners())
+    if learners or any(teacher.source != "map" for teacher in config.sgim.teachers):
+        return None
+    try:
+        maps = {key: with_map(getattr(config.env, key)) for key in ("options", "training")}
+    except (envs.EnvError, TypeError, AttributeError):
+        return None
     names = ("num_envs", "eval_episodes", "device", "devices")
     trainer = TrainerConfig(**{name: getattr(config.trainer, name) for name in names})
-    return programs.structure(config.model_copy(update={"trainer": trainer}))
+    return programs.structure(config.model_copy(update={"env": config.env.model_copy(update=maps), "trainer": trainer}))
+
+
+def with_map(options):
+    """These options with the rows of their map instead of its file, which may change."""
+    return options | {"map": arena.load(options["map"])} if "map" in options else options
 
 
 @pytest.fixture(scope="session")
