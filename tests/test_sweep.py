@@ -343,47 +343,57 @@ def test_the_study_of_another_sweep_is_refused(folder):
 
 
 WORKERS = """
-import os, pickle, sys
+import os, pickle, signal, sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
 from star.sweep import open_ledger, work
 from test_sweep import Stub
 
-found = pickle.loads(Path("plan").read_bytes())
-
-def worker():
-    ledger = open_ledger(found, sys.argv[1], beat_s=1, grace_s=3)
+def worker(found, url):
+    signal.alarm(120)
+    ledger = open_ledger(found, url, beat_s=1, grace_s=3)
     return 0 if work(found, ledger, make=lambda config, slots: Stub(config, slots, wait_s=0.15)) else 1
 
-pids = []
-for _ in range(int(sys.argv[2])):  # forked, because importing JAX is what takes long
-    pid = os.fork()
-    if not pid:
-        os._exit(worker())
-    pids.append(pid)
-print(*pids, flush=True)
-print(*[os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in pids], flush=True)
+for line in sys.stdin:
+    plan, url, count = line.split()
+    found = pickle.loads(Path(plan).read_bytes())
+    pids = []
+    for _ in range(int(count)):  # forked, because importing JAX is what takes long
+        pid = os.fork()
+        if not pid:
+            os._exit(worker(found, url))
+        pids.append(pid)
+    print(*pids, flush=True)
+    print(*[os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) for pid in pids], flush=True)
 """
 
 
-def shared(url, *, workers):
+@pytest.fixture(scope="module")
+def master():
+    """A process that begins workers: for a line with a plan, a database and a number, their pids and exit codes."""
+    where = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, "-c", WORKERS.format(tests=str(ROOT / "tests"))]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen(command, **pipes, text=True, bufsize=1, env=os.environ | where) as process:
+        yield process
+
+
+def shared(master, url, *, workers):
     """Let workers share 8 trials and kill one in the middle of its own: the ledger, and the name of that one."""
     parameters = {"controller.ppo.learning_rate": {"low": 1e-4, "high": 1e-2}}
     path = written(sampler="random", parameters=parameters, trials=8, batch=2)
     found = plan(path)
     Path("plan").write_bytes(pickle.dumps(found))  # planning builds a program, which takes long
     ledger = open_ledger(found, url)
-    where = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "-c", WORKERS.format(tests=str(ROOT / "tests")), url, str(workers)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ | where) as process:
-        pids = [int(pid) for pid in process.stdout.readline().split()]
-        busy = []
-        while not busy:
-            running = [trial for trial in ledger.trials() if trial.state.name == "RUNNING"]
-            busy = [trial.user_attrs["worker"] for trial in running if "worker" in trial.user_attrs]
-        killed = int(busy[-1].rpartition(":")[2])  # the last to begin is the last to end by itself
-        os.kill(killed, signal.SIGKILL)
-        codes = [int(code) for code in process.communicate(timeout=120)[0].split()]
+    print(Path("plan").resolve(), url, workers, file=master.stdin)
+    pids = [int(pid) for pid in master.stdout.readline().split()]
+    busy = []
+    while not busy:
+        running = [trial for trial in ledger.trials() if trial.state.name == "RUNNING"]
+        busy = [trial.user_attrs["worker"] for trial in running if "worker" in trial.user_attrs]
+    killed = int(busy[-1].rpartition(":")[2])  # the last to begin is the last to end by itself
+    os.kill(killed, signal.SIGKILL)
+    codes = [int(code) for code in master.stdout.readline().split()]
     assert codes == [-signal.SIGKILL if pid == killed else 0 for pid in pids]
     return ledger, busy[-1]
 
@@ -398,12 +408,12 @@ def check_shared(ledger, killed):
     assert {trial.user_attrs.get("worker", killed) for trial in given_back} == {killed}
 
 
-def test_two_workers_on_one_sqlite_file_end_all_trials_though_one_is_killed(folder):
-    check_shared(*shared(f"sqlite:///{folder}/sweep.db", workers=2))
+def test_two_workers_on_one_sqlite_file_end_all_trials_though_one_is_killed(folder, master):
+    check_shared(*shared(master, f"sqlite:///{folder}/sweep.db", workers=2))
 
 
-def test_four_workers_on_postgresql_end_all_trials_though_one_is_killed(folder, postgresql):
-    ledger, killed = shared(postgresql, workers=4)
+def test_four_workers_on_postgresql_end_all_trials_though_one_is_killed(folder, master, postgresql):
+    ledger, killed = shared(master, postgresql, workers=4)
     check_shared(ledger, killed)
     assert len({trial.user_attrs["worker"] for trial in ledger.trials()}) >= 3
 

@@ -409,7 +409,7 @@ _, state = checkpoint.load_state(program, run_dir, "last")
 assert all(leaf.sharding.device_set == set(jax.devices()[:2]) for leaf in jax.tree.leaves(state))
 assert jax.device_get(state.epoch).tolist() == [2, 2]
 """
-    run_dir, half = tmp_path / "run", TINY | {"trainer": TINY["trainer"] | {"total_env_steps": 2 * EPOCH}}
+    run_dir, half = tmp_path / "run", TINY | {"trainer": TINY["trainer"] | {"total_env_steps": 2 * EPOCH, "sinks": []}}
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
     environment = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags}
     subprocess.run([sys.executable, "-c", training, json.dumps(half), str(run_dir)], env=environment, check=True)
@@ -449,7 +449,8 @@ def test_a_numeric_hyperparameter_and_the_sinks_may_change_on_resume(finished, t
 
 def test_ctrl_c_writes_a_checkpoint_and_says_how_to_resume(tmp_path):
     alone = {"sgim": {}, "commander": {"enabled": False, "period": 20}, "tutor": {"enabled": False, "unroll": 3}}
-    values = TINY | alone | {"trainer": TINY["trainer"] | {"total_env_steps": 10**9, "eval_every": 10**6}}
+    endless = {"total_env_steps": 10**9, "eval_every": 10**6, "sinks": []}  # TensorBoard's imports PyTorch
+    values = TINY | alone | {"trainer": TINY["trainer"] | endless}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
     command = [sys.executable, "-m", "star.cli", "train", "config.yaml", "--run-dir", "run"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
