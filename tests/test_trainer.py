@@ -173,6 +173,7 @@ def test_an_interrupted_run_resumes_to_the_same_final_state_bit_for_bit(finished
     assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
 
 
+@pytest.mark.usefixtures("finished")  # whose program is compiled: an epoch then ends before it is given up
 def test_sigterm_ends_a_run_like_ctrl_c_but_for_the_exit_code(tmp_path, monkeypatch):
     interrupt_after(monkeypatch, epochs=1, number=signal.SIGTERM)
     result = trainer.train(tiny(), tmp_path / "run", quiet=True)
