@@ -31,6 +31,7 @@ from gymnasium.vector.utils import batch_space
 
 import envs
 from envs.arena import Arena
+from envs.common import modes
 from envs.common.plainly import plain
 from envs.maze import MazeEnv
 from envs.options import normal
@@ -297,7 +298,7 @@ def _compiled(task: str, arena: Arena, num_envs: int, **options: Any) -> Program
         return recorded(vector.step(state, action))
 
     def keys(bits: jax.Array) -> jax.Array:
-        key = jax.random.wrap_key_data(bits, impl="threefry2x32")
+        key = jax.random.wrap_key_data(bits, impl=modes.KEYS)
         return jax.vmap(lambda one: jax.random.split(one, num_envs // len(bits)))(key).reshape(num_envs)
 
     def recorded(state: Any) -> tuple[Any, jax.Array]:

@@ -23,7 +23,7 @@ import numpy as np
 from rich.console import Console
 
 from envs import routes
-from envs.common import files
+from envs.common import files, modes
 from envs.vector import VectorEnv
 from star import checkpoint, evaluation, report
 from star import program as programs
@@ -137,7 +137,7 @@ def _fitting(program: Program, env: Any, *, source: Path) -> Spec:
 
 def _goals(env: Any, middles: np.ndarray) -> np.ndarray:
     """Goals [G, k] at `middles` [G, 2]; what else there is in a goal is as in a test goal."""
-    goals = np.repeat(np.asarray(env.reset(jax.random.key(0)).obs[None, env.state_dim :]), len(middles), axis=0)
+    goals = np.repeat(np.asarray(env.reset(modes.key(0)).obs[None, env.state_dim :]), len(middles), axis=0)
     goals[:, _xy(env.goal_indices)] = middles
     return goals
 

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.common import files
+from envs.common import files, modes
 from star import devices, provenance
 from star import program as programs
 from star._quiet import ocp
@@ -37,7 +37,7 @@ from star.agent.state import TrainState, leaf_name
 from star.config.section import ConfigError
 from star.loading import fields, parse
 from star.migrations import FORMAT, About, Arrays, migrated, migrated_arrays, readable
-from star.program import KEYS, Program
+from star.program import Program
 
 SUMS = "SHA256SUMS"
 _ABOUT = "about.json"
@@ -453,4 +453,6 @@ def plain(state: TrainState) -> TrainState:
 
 
 def _with_keys(saved: Any, example: TrainState) -> TrainState:
-    return jax.tree.map(lambda x, like: jax.random.wrap_key_data(x, impl=KEYS) if _is_key(like) else x, saved, example)
+    return jax.tree.map(
+        lambda x, like: jax.random.wrap_key_data(x, impl=modes.KEYS) if _is_key(like) else x, saved, example
+    )

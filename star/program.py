@@ -35,9 +35,6 @@ from star.spec import Spec
 DURING_TRAINING = 2**32 - 1
 AFTERWARDS = 2**32 - 2
 
-KEYS = "threefry2x32"
-"""The one kind of random keys that runs and checkpoints have, whatever kind JAX has been told to make."""
-
 
 @dataclass(frozen=True)
 class Functions:
@@ -233,16 +230,12 @@ def seeds_of(config: Config) -> list[int]:
 
 def seed_keys(seeds: Sequence[int]) -> jax.Array:
     """Keys that the states of these seeds start from."""
-    return jax.vmap(_key)(np.asarray(seeds, np.uint32))
-
-
-def _key(seed: Any) -> jax.Array:
-    return jax.random.key(seed, impl=KEYS)
+    return jax.vmap(modes.key)(np.asarray(seeds, np.uint32))
 
 
 def evaluation_keys(seeds: Sequence[int], numbers: Sequence[int] | np.ndarray, *, stream: int) -> jax.Array:
     """Keys of one evaluation of each seed; `numbers` are those of `Program.evaluation_keys`."""
-    base, fold = _key(stream), jax.random.fold_in
+    base, fold = modes.key(stream), jax.random.fold_in
     return jax.vmap(lambda number, seed: fold(fold(base, number), seed))(
         np.asarray(numbers, np.uint32), np.asarray(seeds, np.uint32)
     )
@@ -290,11 +283,11 @@ def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: An
     if teacher.flaw == "other_body":
         return teachers.other_body(demos)
     if teacher.flaw == "wrong_half":
-        return teachers.wrong_half(demos, spec.goal_point(tested.reset(_key(0)).obs))
+        return teachers.wrong_half(demos, spec.goal_point(tested.reset(modes.key(0)).obs))
     return demos
 
 
 def _a_goal(spec: Spec, env: Any) -> np.ndarray:
     """A goal that `env` draws, as an abstract point [d]; dimensions that goals leave open are 0."""
-    goal = env.draw_goal(_key(0))
+    goal = env.draw_goal(modes.key(0))
     return np.asarray(spec.goal_point(jax.numpy.concatenate([jax.numpy.zeros(spec.state_dim), goal])))

@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from envs import video
+from envs.common import modes
 from envs.render import FINE_SHADOWS, SHADOWS, Marks, Painter, Stage, aspect_of
 from envs.topdown import Sheet, tiled
 from envs.vector import VectorEnv
@@ -138,7 +139,7 @@ def record_random(config: Config, *, envs: int, steps: int | None, seed: int) ->
         last, moments = jax.lax.scan(step, vector.reset(reset_key), jax.random.split(step_key, length))
         return moments, _look(env, last)
 
-    return Recording(env, _joined(*jax.device_get(jax.jit(play)(jax.random.key(seed)))))
+    return Recording(env, _joined(*jax.device_get(jax.jit(play)(modes.key(seed)))))
 
 
 def record_run(

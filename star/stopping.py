@@ -80,15 +80,15 @@ class Stop:
 def interruptible() -> Iterator[Stop]:
     """Yields what tells whether Ctrl-C was pressed, SIGTERM or SIGHUP came; the first of them calls its `on_first`.
 
-    Signals that the process ignores, as under `nohup`, stay ignored. Outside of the main thread, where Python lets
+    A SIGHUP that the process ignores, as under `nohup`, stays ignored. Outside of the main thread, where Python lets
     nobody hear signals, they are the caller's.
     """
     stop = Stop()
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    heard = [number for number in _SIGNALS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
-    before = {number: signal.signal(number, stop.hear) for number in heard}
+    ignored = signal.getsignal(signal.SIGHUP) in (signal.SIG_IGN, None)
+    before = {number: signal.signal(number, stop.hear) for number in _SIGNALS[: -1 if ignored else None]}
     try:
         yield stop
     finally:

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
+from urllib.parse import quote
 
 import numpy as np
 import optuna
@@ -264,6 +265,11 @@ def reason(trial: FrozenTrial) -> str:
     if trial.state != TrialState.FAIL:
         return ""
     return str(trial.user_attrs.get(_REASON, f"its worker died {RETRIES + 1} times"))
+
+
+def sqlite_url(path: Path) -> str:
+    """The address of the SQLite database in that file."""
+    return f"sqlite:///{quote(str(path.absolute()))}"
 
 
 def sqlalchemy_url(url: str) -> sqlalchemy.URL:

@@ -22,7 +22,6 @@ from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self, get_args
-from urllib.parse import quote
 
 from optuna import pruners, samplers
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
@@ -42,7 +41,7 @@ from star.loading import check_setting, explain, kind, load, parse, read_file
 from star.metrics import mean
 from star.side_by_side import SideBySide
 from star.stopping import interruptible
-from star.study import MEASURED, Cmaes, Holding, Ledger, product, reachable, reason
+from star.study import MEASURED, Cmaes, Holding, Ledger, product, reachable, reason, sqlite_url
 
 _MAX_GRID = 100_000  # points
 _WAIT_S = 2.0  # between looks at what other workers do
@@ -260,7 +259,7 @@ def run(
         raise ConfigError(f"{out}: is not empty and holds no sweep.db to go on with; choose another --out")
     if storage is None:
         _make(out)
-    url = storage or f"sqlite:///{quote(str(database.absolute()))}"
+    url = storage or sqlite_url(database)
     with reachable(url):
         if storage is None:
             _check_alone(found, out, url)

@@ -13,8 +13,8 @@ import subprocess
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from urllib.parse import quote
 
 import gymnasium
 import jax
@@ -37,7 +37,7 @@ from star.sgim import teachers
 from star.spec import Spec
 from star.stopping import interruptible
 from star.streams import unbroken
-from star.study import sqlalchemy_url
+from star.study import sqlalchemy_url, sqlite_url
 
 ROOT = Path(__file__).parents[1]
 
@@ -382,8 +382,7 @@ def test_a_process_forked_from_one_that_runs_jax_is_told_so_instead_of_hanging()
 def test_a_sweep_keeps_its_database_in_a_folder_of_any_name(name, tmp_path):
     folder = tmp_path / name
     folder.mkdir()
-    url = f"sqlite:///{quote(str(folder / 'sweep.db'))}"
-    assert sqlalchemy_url(url).database == str(folder / "sweep.db")
+    assert sqlalchemy_url(sqlite_url(folder / "sweep.db")).database == str(folder / "sweep.db")
 
 
 def test_what_is_imported_leaves_the_loggers_of_the_user_alone():
@@ -391,6 +390,25 @@ def test_what_is_imported_leaves_the_loggers_of_the_user_alone():
     subprocess.run([sys.executable, "-c", words], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
 
 
-def test_a_run_refuses_to_stop_at_what_is_infinite_by_design():
-    with jax.debug_infs(True), pytest.raises(UserError, match="^JAX_DEBUG_INFS: is on"):
-        programs.build(parse({}))
+@pytest.mark.parametrize("mode", [partial(jax.debug_infs, True), partial(jax.numpy_rank_promotion, "raise")])
+@pytest.mark.parametrize("use", ["programs.build", "goal_selection"])
+def test_what_learns_refuses_the_modes_that_it_does_not_run_in(mode, use):
+    with mode(), pytest.raises(UserError, match="^JAX_(DEBUG_INFS: is on|NUMPY_RANK_PROMOTION: is raise)"):
+        goal_selection() if use == "goal_selection" else programs.build(parse({}))
+
+
+def goal_selection():
+    """Blocks of choices and updates, after which everything is known."""
+    config, bins = sgim.Config(), regions.create(([0.0], [3.0]), [[1.0, 2.0]], max_regions=4)
+    state = sgim.init(config, bins, costs=[1.0, 3.0])
+    for seed in range(2):
+        choose = jax.vmap(lambda key, state: sgim.select(config, state, key=key), in_axes=(0, None))
+        choice = choose(jax.random.split(jax.random.key(seed), 4), state)
+        state = jax.jit(partial(sgim.update, config))(state, choice, jnp.linspace(0.0, 1.0, 4))
+    return state
+
+
+def test_goal_selection_makes_no_number_that_is_none():
+    with jax.debug_nans(True):
+        state = goal_selection()
+    assert int(state.blocks) == 2

@@ -9,6 +9,9 @@ import jax
 
 from envs.common.errors import UserError
 
+KEYS = "threefry2x32"
+"""The kind of all keys that runs, checkpoints and seeded environments have, whichever JAX makes by itself."""
+
 
 def check() -> None:
     """Raise `UserError` in one line that names the mode, if numbers would not be float32, or types not promoted."""
@@ -19,13 +22,26 @@ def check() -> None:
         raise UserError("JAX_NUMPY_DTYPE_PROMOTION: is strict; allowed: standard")
 
 
+def check_learning() -> None:
+    """Raise `UserError` in one line that names a mode in which environments run, but nothing that learns."""
+    config: Any = jax.config
+    if config.jax_debug_infs:
+        raise UserError("JAX_DEBUG_INFS: is on; what is not known yet is infinite here: switch it off")
+    if config.jax_numpy_rank_promotion == "raise":
+        raise UserError("JAX_NUMPY_RANK_PROMOTION: is raise; allowed: allow, warn")
+
+
 def check_training() -> None:
     """Raise `UserError` in one line that names a mode in which no run can be trained, or go on as it was."""
     config: Any = jax.config
     if not config.jax_threefry_partitionable:
         raise UserError("JAX_THREEFRY_PARTITIONABLE: is off, which changes what is drawn; allowed: on")
-    if config.jax_debug_infs:
-        raise UserError("JAX_DEBUG_INFS: is on; what is not known yet is infinite here: switch it off")
+    check_learning()
+
+
+def key(seed: Any) -> jax.Array:
+    """The random key of a seed: the same in every mode of JAX that decides about keys."""
+    return jax.random.key(seed, impl=KEYS)
 
 
 def missing_device() -> str | None:

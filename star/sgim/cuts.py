@@ -32,7 +32,7 @@ def on_split(state: SgimState, abstraction: Abstraction, split: Split) -> SgimSt
     inherit = lambda table: regions.inherit(table, parent=parent, child=child, axes=(0,))  # noqa: E731
     parts = state.replace(
         abstraction=abstraction,
-        mean=state.mean.at[jnp.array([parent, child])].set(jnp.nan),
+        mean=state.mean.at[jnp.array([parent, child])].set(jnp.inf),
         shares=inherit(state.shares),
         gains=inherit(state.gains),
         doubt=inherit(state.doubt),

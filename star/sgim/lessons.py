@@ -244,7 +244,7 @@ def grade(lesson: Lesson, over: Bool[Array, "B"], distance: Float[Array, "B"], *
     """Take down the competence of those first episodes that are `over`, `distance` m from their goals."""
     away = jnp.maximum(distance - radius, 0.0)
     competence = jnp.where(away > 0, 1 - jnp.minimum(1.0, away / jnp.maximum(lesson.away, 1e-6)), 1.0)
-    return lesson.replace(competence=jnp.where(over & jnp.isnan(lesson.competence), competence, lesson.competence))
+    return lesson.replace(competence=jnp.where(over & jnp.isinf(lesson.competence), competence, lesson.competence))
 
 
 def learn(config: SgimConfig, state: SgimState, lesson: Lesson) -> tuple[SgimState, Metrics]:

@@ -51,7 +51,7 @@ class SgimState(struct.PyTreeNode):
     written: Int[Array, "R"]
     """Episodes written to the window of each region since it came to be."""
     mean: Float[Array, "R"]
-    """Mean competence in the last block of each region; NaN before the first, and after a cut."""
+    """Mean competence in the last block of each region; infinite before the first, and after a cut."""
     shares: Float[Array, "R S"]
     """Share of each strategy in the last block of each region."""
     gains: Float[Array, "R S"]
@@ -86,6 +86,7 @@ def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[floa
 
     """
     modes.check()
+    modes.check_learning()
     price = np.asarray(costs, np.float32)
     if price.ndim != 1 or not len(price) or not (np.isfinite(price) & (price > 0)).all():
         raise ValueError(f"costs: {price.tolist()}; allowed: a list of positive numbers, one for each strategy")
@@ -97,7 +98,7 @@ def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[floa
         goals=jnp.zeros((capacity, config.window, d)),
         competences=jnp.zeros((capacity, config.window)),
         written=jnp.zeros(capacity, jnp.int32),
-        mean=jnp.full(capacity, jnp.nan, jnp.float32),
+        mean=jnp.full(capacity, jnp.inf, jnp.float32),
         shares=jnp.zeros(pairs),
         gains=jnp.zeros(pairs),
         doubt=jnp.ones(pairs),
@@ -291,7 +292,7 @@ def _remember(
     config: SelectionConfig, state: SgimState, choice: Choice, competences: Array, counted: Array
 ) -> SgimState:
     """Write to each region's window, over its oldest episodes, at most `per_block` of this block drawn at random."""
-    order = jax.random.permutation(jax.random.fold_in(jax.random.key(0), state.blocks), len(competences))
+    order = jax.random.permutation(jax.random.fold_in(modes.key(0), state.blocks), len(competences))
     region, goals, competences, counted = (x[order] for x in (choice.region, choice.goal, competences, counted))
     capacity = len(state.written)
     mine = (region[:, None] == jnp.arange(capacity)) * counted[:, None].astype(jnp.int32)

@@ -44,7 +44,7 @@ class Lesson(struct.PyTreeNode):
     away: Float[Array, "B"]
     """d_0, in m."""
     competence: Float[Array, "B"]
-    """Of the first episode of the epoch; NaN until it is over."""
+    """Of the first episode of the epoch; infinite until it is over."""
 
 
 def init(config: SgimConfig, abstraction: Abstraction) -> SgimState:
@@ -128,7 +128,7 @@ def _prepare(
         first=first,
         leg=first,
         away=jnp.zeros(len(goal)),
-        competence=jnp.full(len(goal), jnp.nan, jnp.float32),
+        competence=jnp.full(len(goal), jnp.inf, jnp.float32),
     )
 
 

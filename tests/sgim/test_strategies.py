@@ -244,10 +244,10 @@ def test_a_way_leaves_a_region_where_one_who_walks_it_first_does():
 def test_competence_is_how_much_nearer_the_first_episode_came():
     lesson = lesson_of(settings(goals=True))[0].replace(away=jnp.full(B, 8.0))
     lesson = lessons.grade(lesson, jnp.arange(B) == 0, jnp.full(B, 6.0), radius=2.0)  # from 8 m to 4 m
-    assert float(lesson.competence[0]) == pytest.approx(0.5) and np.isnan(lesson.competence[1:]).all()
+    assert float(lesson.competence[0]) == pytest.approx(0.5) and np.isinf(lesson.competence[1:]).all()
     lesson = lessons.grade(lesson, jnp.ones(B, bool), jnp.full(B, 1.0), radius=2.0)
     assert float(lesson.competence[0]) == pytest.approx(0.5) and (lesson.competence[1:] == 1).all()
-    away = lesson.replace(competence=jnp.full(B, jnp.nan))
+    away = lesson.replace(competence=jnp.full(B, jnp.inf))
     worse = lessons.grade(away, jnp.ones(B, bool), jnp.full(B, 30.0), radius=2.0)
     assert (worse.competence == 0).all()
 
