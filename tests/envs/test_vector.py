@@ -185,17 +185,17 @@ def test_the_derivative_of_a_batch_is_that_of_each_environment(env, auto_reset):
     def rewards(action):
         return vector.step(state, action).reward
 
-    each = jax.vmap(jax.grad(lambda one, action: env.step(one, action).reward, argnums=1))(state, action)
+    each = jax.jit(jax.vmap(jax.grad(lambda one, action: env.step(one, action).reward, argnums=1)))(state, action)
     assert (jnp.abs(each) > 0).any()
-    np.testing.assert_allclose(jax.jit(jax.grad(lambda a: rewards(a).sum()))(action), each, rtol=1e-5)
-    forward = jax.jacfwd(rewards)(action)
+    forward = jax.jit(jax.jacfwd(rewards))(action)
     np.testing.assert_allclose(jnp.einsum("iij->ij", forward), each, rtol=1e-5)
     pair = jnp.stack([action, action])
-    for nested in (
-        jax.vmap(jax.grad(lambda a: rewards(a).sum())),
-        jax.grad(lambda a: jax.vmap(rewards)(a).sum()),
+    for expected, found in (
+        (each, jax.jit(jax.grad(lambda a: rewards(a).sum()))(action)),
+        (jnp.stack([each, each]), jax.jit(jax.vmap(jax.grad(lambda a: rewards(a).sum())))(pair)),
+        (jnp.stack([each, each]), jax.jit(jax.grad(lambda a: jax.vmap(rewards)(a).sum()))(pair)),
     ):
-        np.testing.assert_allclose(nested(pair), jnp.stack([each, each]), rtol=1e-5)
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_an_engine_without_derivatives_says_so_in_one_line():
