@@ -6,6 +6,7 @@ import copy
 import errno
 import hashlib
 import io
+import json
 import os
 import pickle
 import signal
@@ -38,8 +39,10 @@ from star.spec import Spec
 from star.stopping import interruptible
 from star.streams import unbroken
 from star.study import sqlalchemy_url, sqlite_url
+from tests.scripts import load
 
 ROOT = Path(__file__).parents[1]
+NOTED = sorted(ROOT.glob("results/compatibility/*.json"))
 
 
 @pytest.mark.parametrize(
@@ -412,3 +415,43 @@ def test_goal_selection_makes_no_number_that_is_none():
     with jax.debug_nans(True):
         state = goal_selection()
     assert int(state.blocks) == 2
+
+
+@pytest.fixture(scope="module")
+def matrix():
+    return load("checks/matrix")
+
+
+@pytest.mark.parametrize("title", ["Types of options", "Encodings of files"])
+def test_a_sample_of_the_matrix_is_as_it_was_noted(matrix, title):
+    """The page shows what the whole of it gave; here are those of its tables that take least."""
+    found = {"Types of options": matrix.types, "Encodings of files": matrix.files}[title]()
+    noted = [tables[title] for path in NOTED for tables in json.loads(path.read_text()).values()]
+    assert len(noted) >= 1
+    for table in noted:
+        assert found == table
+
+
+def test_the_matrix_has_no_fault_and_the_page_shows_it(matrix):
+    both = {machine: tables for path in NOTED for machine, tables in json.loads(path.read_text()).items()}
+    lines = [
+        line for tables in both.values() for table in tables.values() for row in table.values() for line in row.values()
+    ]
+    assert len(lines) > 250 and not [line for line in lines if line.startswith("FAULT")]
+    assert matrix.page(both) in (ROOT / "docs/compatibility.md").read_text(encoding="utf-8")
+
+
+def test_the_matrix_tells_works_from_refused_from_faults(matrix):
+    def refused():
+        raise UserError("key: 3; allowed: 4")
+
+    assert matrix.outcome(lambda: None) == "works"
+    assert matrix.outcome(refused) == "key: 3; allowed: 4"
+    assert matrix.outcome(lambda: 1 / 0).startswith("FAULT: ZeroDivisionError")
+
+
+def test_every_mend_can_be_taken_back_and_has_its_test():
+    for mend in load("checks/mends").MENDS:
+        assert (ROOT / mend.file).read_text(encoding="utf-8").count(mend.now) == 1, mend.fault
+        file, _, name = mend.test.partition("::")
+        assert f"def {name.partition('[')[0]}(" in (ROOT / file).read_text(encoding="utf-8"), mend.fault

@@ -1,7 +1,6 @@
 import argparse
 import collections
 import dataclasses
-import importlib.util
 import json
 import random
 import shutil
@@ -27,16 +26,7 @@ from star.checkpoint import Checkpoints, Damaged
 from star.learners import replay
 from star.metrics import JsonLines
 from star.spec import Spec
-
-SCRIPTS = Path(__file__).parents[1] / "scripts"
-
-
-def load(name):
-    spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # where dataclasses look for what their annotations mean
-    spec.loader.exec_module(module)
-    return module
+from tests.scripts import load
 
 
 def test_the_check_of_the_physics_passes_and_notices_another_model(monkeypatch):
