@@ -279,11 +279,11 @@ def transformations() -> Table:
         "`VectorEnv.step`": (lambda a: vector.step(two, a).reward, jnp.full((2, 2), 0.3)),
         "`MazeEnv.reset`": (lambda x: env.reset(jax.random.key(1)).obs * x, jnp.ones(())),
         "`VectorEnv.reset`": (lambda x: vector.reset(jax.random.key(1)).obs * x, jnp.ones(())),
-        "`sgim.probabilities`": (
+        "`star.sgim.probabilities`": (
             lambda x: sgim.probabilities(config, state.replace(gains=state.gains + x)),
             jnp.full(state.gains.shape, 0.3),
         ),
-        "`sgim.update`": (lambda x: sgim.update(config, state, choices, x).gains, jnp.full(4, 0.3)),
+        "`star.sgim.update`": (lambda x: sgim.update(config, state, choices, x).gains, jnp.full(4, 0.3)),
     }
 
     def same(found: Any, expected: Any) -> None:
