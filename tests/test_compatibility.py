@@ -289,15 +289,13 @@ def test_signals_are_the_callers_outside_of_the_main_thread():
     assert found == [False] and signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_closed_terminal_stops_a_run_as_sigterm_does_unless_it_is_ignored():
-    with interruptible() as stop:
-        os.kill(os.getpid(), signal.SIGHUP)
-        assert stop() and stop.terminated
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+@pytest.mark.parametrize(("as_it_was", "heard"), [(signal.SIG_DFL, True), (signal.SIG_IGN, False)])
+def test_a_closed_terminal_stops_a_run_as_sigterm_does_unless_it_is_ignored(as_it_was, heard):
+    before = signal.signal(signal.SIGHUP, as_it_was)
     try:
         with interruptible() as stop:
             os.kill(os.getpid(), signal.SIGHUP)
-            assert not stop()
+            assert (stop(), stop.terminated) == (heard, heard)
     finally:
         signal.signal(signal.SIGHUP, before)
 
