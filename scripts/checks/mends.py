@@ -371,7 +371,7 @@ def passes(test: str, tree: Path) -> bool:
         done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, timeout=LIMIT, check=False)
     except subprocess.TimeoutExpired:
         return False
-    if done.returncode not in (0, 1):
+    if done.returncode > 1:  # below 0: a signal ended it
         raise SystemExit(f"{test}: pytest ended with {done.returncode}: {done.stdout.decode()[-500:]}")
     return done.returncode == 0
 
