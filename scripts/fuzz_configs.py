@@ -64,16 +64,7 @@ MOST_WORK = 100_000  # env steps and sampled transitions of an epoch and its eva
 MOST_HELD = 8  # programs at a time
 MEMORY = 12 * 2**30  # bytes of addresses
 
-BASE: dict[str, Any] = {
-    "env": {"name": "point_maze", "options": {"episode_length": 40}},
-    "commander": {"period": 20},
-    "tutor": {"unroll": 2, "ppo": {"hidden": [4], "passes": 1, "minibatches": 1}},
-    "controller": {"ppo": {"hidden": [4], "passes": 1, "minibatches": 1}},
-    "abstraction": {"max_regions": 6},
-    "forward_model": {"hidden": [4], "buffer_size": 32, "batch_size": 4, "updates_per_epoch": 1},
-    "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
-    "trainer": {"num_envs": 2, "total_env_steps": 80, "eval_episodes": 2},
-}
+BASE: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("smallest.yaml").read_text(encoding="utf-8"))
 TEXT = yaml.safe_dump(BASE, sort_keys=False)
 MAP = "11111\n1r001\n11101\n10001\n11111\n"
 OPTIONS = (

@@ -87,8 +87,9 @@ def interruptible() -> Iterator[Stop]:
     if threading.current_thread() is not threading.main_thread():
         yield stop
         return
-    ignored = signal.getsignal(signal.SIGHUP) in (signal.SIG_IGN, None)
-    before = {number: signal.signal(number, stop.hear) for number in _SIGNALS[: -1 if ignored else None]}
+    nohup = signal.getsignal(signal.SIGHUP) in (signal.SIG_IGN, None)
+    heard = [number for number in _SIGNALS if not (nohup and number == signal.SIGHUP)]
+    before = {number: signal.signal(number, stop.hear) for number in heard}
     try:
         yield stop
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -57,18 +58,7 @@ def train(
     alone = locked(run_dir, warn=warn) if first else nullcontext()
     with interruptible() as stop, alone, closing(checkpoints):
         stop.patient = jax.process_count() > 1  # the others would wait for ever for one that leaves an epoch
-        if resume:
-            settings = starting.settings(run_dir, program)
-            state = starting.restored(program, checkpoints, journal, warn=warn)
-        else:
-            settings = {}
-            starting.note(run_dir, program.config)
-            state = program.init(program.seed_keys())
-        began = _epochs(state) * program.env_steps_per_epoch
-        here = provenance.here(devices=config.trainer.devices)
-        journal.provenance.write({"env_steps": began, "settings": settings} | here)
-        if config.trainer.on_non_finite == "rollback" and not checkpoints.steps():
-            checkpoints.save(0, state, program.config, success=0.0)  # there is always one to go back to
+        state, began = _begin(program, run_dir, checkpoints, journal, resume=resume, warn=warn)
         records = Records(program, journal)
         while True:
             slowed, state = rollback.slowed(program, state, journal, env_steps=began)
@@ -85,6 +75,31 @@ def train(
             if result.interrupted:
                 return replace(result, env_steps=began, fault=None)
             profile = 0
+
+
+def _begin(
+    program: Program,
+    run_dir: Path,
+    checkpoints: Checkpoints,
+    journal: Journal,
+    *,
+    resume: bool,
+    warn: Callable[[str], None],
+) -> tuple[TrainState, int]:
+    """The state to train from, fresh or restored, and its env steps; notes down with what and where they began."""
+    if resume:
+        settings = starting.settings(run_dir, program)
+        state = starting.restored(program, checkpoints, journal, warn=warn)
+    else:
+        settings = {}
+        starting.note(run_dir, program.config)
+        state = program.init(program.seed_keys())
+    began = _epochs(state) * program.env_steps_per_epoch
+    here = provenance.here(devices=program.config.trainer.devices)
+    journal.provenance.write({"env_steps": began, "settings": settings} | here)
+    if program.config.trainer.on_non_finite == "rollback" and not checkpoints.steps():
+        checkpoints.save(0, state, program.config, success=0.0)  # there is always one to go back to
+    return state, began
 
 
 def _epochs(state: TrainState) -> int:

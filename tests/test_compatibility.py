@@ -391,33 +391,22 @@ def test_what_is_imported_leaves_the_loggers_of_the_user_alone():
     subprocess.run([sys.executable, "-c", words], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
 
 
-@pytest.mark.parametrize("mode", [partial(jax.debug_infs, True), partial(jax.numpy_rank_promotion, "raise")])
-@pytest.mark.parametrize("use", ["programs.build", "goal_selection"])
-def test_what_learns_refuses_the_modes_that_it_does_not_run_in(mode, use):
-    with mode(), pytest.raises(UserError, match="^JAX_(DEBUG_INFS: is on|NUMPY_RANK_PROMOTION: is raise)"):
-        goal_selection() if use == "goal_selection" else programs.build(parse({}))
-
-
-def goal_selection():
-    """Blocks of choices and updates, after which everything is known."""
-    config, bins = sgim.Config(), regions.create(([0.0], [3.0]), [[1.0, 2.0]], max_regions=4)
-    state = sgim.init(config, bins, costs=[1.0, 3.0])
-    for seed in range(2):
-        choose = jax.vmap(lambda key, state: sgim.select(config, state, key=key), in_axes=(0, None))
-        choice = choose(jax.random.split(jax.random.key(seed), 4), state)
-        state = jax.jit(partial(sgim.update, config))(state, choice, jnp.linspace(0.0, 1.0, 4))
-    return state
-
-
-def test_goal_selection_makes_no_number_that_is_none():
-    with jax.debug_nans(True):
-        state = goal_selection()
-    assert int(state.blocks) == 2
-
-
 @pytest.fixture(scope="module")
 def matrix():
     return load("checks/matrix")
+
+
+@pytest.mark.parametrize("mode", [partial(jax.debug_infs, True), partial(jax.numpy_rank_promotion, "raise")])
+@pytest.mark.parametrize("use", ["programs.build", "goal_selection"])
+def test_what_learns_refuses_the_modes_that_it_does_not_run_in(matrix, mode, use):
+    with mode(), pytest.raises(UserError, match="^JAX_(DEBUG_INFS: is on|NUMPY_RANK_PROMOTION: is raise)"):
+        matrix.goal_selection() if use == "goal_selection" else programs.build(parse({}))
+
+
+def test_goal_selection_makes_no_number_that_is_none(matrix):
+    with jax.debug_nans(True):
+        state = matrix.goal_selection()
+    assert int(state.blocks) == 5
 
 
 @pytest.mark.parametrize("title", ["Types of options", "Encodings of files"])

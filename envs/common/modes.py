@@ -23,7 +23,8 @@ def check() -> None:
 
 
 def check_learning() -> None:
-    """Raise `UserError` in one line that names a mode in which environments run, but nothing that learns."""
+    """Raise `UserError` in one line that names a mode in which nothing runs that learns, though environments may."""
+    check()
     config: Any = jax.config
     if config.jax_debug_infs:
         raise UserError("JAX_DEBUG_INFS: is on; what is not known yet is infinite here: switch it off")

@@ -23,7 +23,6 @@ import platform
 import subprocess
 import sys
 import tempfile
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -54,16 +53,7 @@ MODES: Mapping[str, tuple[Mapping[str, str], Sequence[str]]] = {
     "`JAX_PLATFORMS=abacus`": ({"JAX_PLATFORMS": "abacus"}, ()),
     "`python -O`": ({}, ("-O",)),
 }
-TRAINED: dict[str, Any] = {
-    "env": {"name": "point_maze", "options": {"episode_length": 40}},
-    "commander": {"period": 20},
-    "tutor": {"unroll": 2, "ppo": {"hidden": [4], "passes": 1, "minibatches": 1}},
-    "controller": {"ppo": {"hidden": [4], "passes": 1, "minibatches": 1}},
-    "abstraction": {"max_regions": 6},
-    "forward_model": {"hidden": [4], "buffer_size": 32, "batch_size": 4, "updates_per_epoch": 1},
-    "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
-    "trainer": {"num_envs": 2, "total_env_steps": 160, "eval_every": 2, "eval_episodes": 2},
-}
+TRAINED = ROOT / "scripts/smallest.yaml"
 
 
 # Objects, each used for a few steps
@@ -193,12 +183,9 @@ def command(*words: str) -> None:
 
 def trainer() -> Any:
     """`star train` of all three levels, resumed, and `star evaluate`."""
-    import yaml
-
     with tempfile.TemporaryDirectory() as folder:
-        config, run = Path(folder) / "small.yaml", f"{folder}/run"
-        config.write_text(yaml.safe_dump(TRAINED))
-        command("train", str(config), "--run-dir", run, "--quiet", "--total-env-steps", "80")
+        run = f"{folder}/run"
+        command("train", str(TRAINED), "--run-dir", run, "--quiet", "--total-env-steps", "80")
         command("train", "--resume", run, "--quiet", "--total-env-steps", "160")
         command("evaluate", run, "--quiet")
 
@@ -338,13 +325,29 @@ def use(thing: Any) -> None:
         thing.step(np.full(2, 0.5, np.float32))
 
 
+def use_in_a_process(thing: Any) -> None:
+    """Use `thing` in a process of its own, begun anew."""
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=unpacked_elsewhere, args=(pickle.dumps(thing), queue))
+    process.start()
+    process.join(300)
+    assert process.exitcode == 0, "the other process failed"
+
+
+def use_in_threads(thing: Any) -> None:
+    """Use `thing` in two threads at once."""
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(use, [thing, thing]))
+
+
 def travels() -> Table:
     """Objects x ways to travel."""
     import jax
 
     import envs
     from star import sgim
-    from star.loading import parse
+    from star.loading import load
 
     env = envs.make("point_maze", episode_length=9)
     things = {
@@ -356,40 +359,15 @@ def travels() -> Table:
         "a state of `VectorEnv`": envs.VectorEnv(env, 2).reset(jax.random.PRNGKey(0)).obs,
         "`sgim.Config`": sgim.Config(),
         "`SgimState`": goal_selection(),
-        "a config": parse(TRAINED),
+        "a config": load(TRAINED),
     }
     things["`gymnasium.make`"].reset(seed=0)
-
-    def spawn(thing: Any) -> None:
-        context = multiprocessing.get_context("spawn")
-        queue = context.Queue()
-        process = context.Process(target=unpacked_elsewhere, args=(pickle.dumps(thing), queue))
-        process.start()
-        process.join(300)
-        assert process.exitcode == 0, "the other process failed"
-
-    def thread(thing: Any) -> None:
-        failed: list[BaseException] = []
-
-        def work() -> None:
-            try:
-                use(thing)
-            except BaseException as error:
-                failed.append(error)
-
-        workers = [threading.Thread(target=work) for _ in range(2)]
-        for worker in workers:
-            worker.start()
-        for worker in workers:
-            worker.join()
-        if failed:
-            raise failed[0]
 
     ways: dict[str, Callable[[Any], None]] = {
         "pickle": lambda thing: use(pickle.loads(pickle.dumps(thing))),
         "deepcopy": lambda thing: use(copy.deepcopy(thing)),
-        "spawn": spawn,
-        "threads": thread,
+        "spawn": use_in_a_process,
+        "threads": use_in_threads,
     }
     if importable("cloudpickle"):
         import cloudpickle
@@ -510,12 +488,10 @@ def _as_parsed(loading: Any, key: str, value: Any) -> Any:
 
 def files() -> Table:
     """Files that are read x encodings and line ends."""
-    import yaml
-
     import envs
     from star import loading, sweep
 
-    config = yaml.safe_dump(TRAINED, allow_unicode=True) + "# \N{GREEK SMALL LETTER ALPHA}\n"
+    config = TRAINED.read_text(encoding="utf-8") + "# \N{GREEK SMALL LETTER ALPHA}\n"
     layer = "tutor:\n  reward: distance  # \N{GREEK SMALL LETTER ALPHA}\n"
     rows = "11111\n1r001\n11111\n"
     plan = (ROOT / "configs/sweeps/three_values.yaml").read_text(encoding="utf-8")
@@ -593,7 +569,7 @@ def page(found: Mapping[str, Mapping[str, Table]]) -> str:
                 for column in columns
             ]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
-        lines += ["", *(f"{number}. `{line}`" for line, number in notes.items()), ""]
+        lines += ["", *(f"{number}. `{line}`" for line, number in notes.items()), *[""] * bool(notes)]
     return "\n".join(lines).rstrip() + "\n"
 
 

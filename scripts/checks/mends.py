@@ -350,17 +350,27 @@ MENDS = (
 )
 
 
-def outcome(mend: Mend, tree: Path) -> str:
-    """What comes of the test of `mend` in `tree`, with the mend and without."""
-    file = tree / mend.file
-    text = file.read_text(encoding="utf-8")
-    if not passes(mend.test, tree):
-        return "the test fails as it is"
-    file.write_text(text.replace(mend.now, mend.before), encoding="utf-8")
-    try:
+def outcome(mend: Mend) -> str:
+    """What comes of the test of `mend` in a copy of the tree, with the mend and without."""
+    with tempfile.TemporaryDirectory() as folder:
+        tree = Path(folder)
+        copy(tree)
+        if not passes(mend.test, tree):
+            return "the test fails as it is"
+        text = (tree / mend.file).read_text(encoding="utf-8")
+        (tree / mend.file).write_text(text.replace(mend.now, mend.before), encoding="utf-8")
         return "the test passes without the mend" if passes(mend.test, tree) else "held"
-    finally:
-        file.write_text(text, encoding="utf-8")
+
+
+def copy(tree: Path) -> None:
+    """Fill `tree` with all that tests need: what git knows or could add, but for results."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    for name in listed.stdout.splitlines():
+        if not name.startswith("results/"):
+            (tree / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, tree / name)
 
 
 def passes(test: str, tree: Path) -> bool:
@@ -382,25 +392,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="*", default=[], help="words of which a fault must have one")
     options = parser.parse_args(arguments)
     chosen = [mend for mend in MENDS if not options.only or any(word in mend.fault for word in options.only)]
-    listed = subprocess.run(
-        ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
-    )
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(options.jobs) as pool:
-
-        def tried(mend: Mend) -> str:
-            tree = Path(tempfile.mkdtemp(dir=folder))
-            for name in listed.stdout.splitlines():
-                if name.startswith(
-                    ("envs/", "star/", "tests/", "configs/", "scripts/", "pyproject", "docs/", "README")
-                ):
-                    (tree / name).parent.mkdir(parents=True, exist_ok=True)
-                    shutil.copy(ROOT / name, tree / name)
-            found = outcome(mend, tree)
-            shutil.rmtree(tree)
-            return found
-
-        found = []
-        for mend, line in zip(chosen, pool.map(tried, chosen), strict=True):
+    found = []
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for mend, line in zip(chosen, pool.map(outcome, chosen), strict=True):
             print(f"{line:35} {mend.fault}", flush=True)
             found.append(line)
     held = found.count("held")

@@ -85,7 +85,6 @@ def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[floa
       UserError: if JAX is in a mode that nothing here runs in.
 
     """
-    modes.check()
     modes.check_learning()
     price = np.asarray(costs, np.float32)
     if price.ndim != 1 or not len(price) or not (np.isfinite(price) & (price > 0)).all():

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from envs.common import modes
 from star.abstraction.regions import Abstraction, locate
 from star.sgim import mixtures, selection
 from star.sgim.mixtures import Mixture
@@ -217,7 +218,7 @@ def alp_gmm(
         remembered = remembered.at[slots % memory].set(goals)
         reached = reached.at[slots % memory].set(competences)
         due = (n + len(goals)) // every > n // every
-        mixture = jax.lax.cond(due, lambda: _fitted(points, most, key=jax.random.key(n)), lambda: mixture)
+        mixture = jax.lax.cond(due, lambda: _fitted(points, most, key=modes.key(n)), lambda: mixture)
         return remembered, reached, points, mixture, n + len(goals)
 
     return Selector(start, select, update)
