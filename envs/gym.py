@@ -5,8 +5,7 @@
     info        = distance (m), is_success, fault
 
 Both kinds run a `VectorEnv` through two compiled functions, which all environments of the same task, options and
-number share. After each call one array goes to the host, a record [B, n + 3]: observation [n], then done, truncation
-and fault as 0 or 1.
+number share: `envs.gym_program`.
 
 Distance, success and reward are computed on the host from the observation. Computed along with the step they could
 differ in the last bit from what `compute_reward` makes of the same goals.
@@ -14,57 +13,25 @@ differ in the last bit from what `compute_reward` makes of the same goals.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import gymnasium
 import jax
-import jax.numpy as jnp
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.spaces import Box, Dict
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 import envs
-from envs.arena import Arena
-from envs.common import modes
 from envs.common.plainly import plain
+from envs.gym_program import Observation, Program, compute_reward, goals, like, program, raw, read, spaces
 from envs.maze import MazeEnv
-from envs.options import normal
 
-Observation = dict[str, np.ndarray]
 Info = dict[str, Any]
 
 RENDER_MODE = "rgb_array"
-LARGEST = np.finfo(np.float32).max  # observations are finite, and nothing more is known of them
-PROGRAMS = 16  # that are kept compiled
-
-
-class Program(NamedTuple):
-    """The compiled functions of a batch of B environments. Both return the new state and a record of it.
-
-    `step` takes a state and actions [B, action_size]; `begin` a state, a mask (bool [B]) of the environments that
-    begin an episode, and 64 random bits for all (uint32 [1, 2]) or for each (uint32 [B, 2]). `blank` is a state to
-    begin from.
-    """
-
-    env: MazeEnv
-    blank: Any
-    begin: Callable[[Any, np.ndarray, np.ndarray], tuple[Any, Any]]
-    step: Callable[[Any, np.ndarray], tuple[Any, Any]]
-
-
-class Record(NamedTuple):
-    """A record on the host: observations [B, n] and three flags (bool [B])."""
-
-    obs: np.ndarray
-    done: np.ndarray
-    truncated: np.ndarray
-    fault: np.ndarray
 
 
 class _Travels:
@@ -78,7 +45,7 @@ class _Travels:
         left = {"_program", "maze"}
         kept = {name: value for name, value in vars(self).items() if name not in left}
         if self._state is not None:
-            kept["_state"] = [np.asarray(_raw(leaf)) for leaf in jax.tree.leaves(self._state)]
+            kept["_state"] = [np.asarray(raw(leaf)) for leaf in jax.tree.leaves(self._state)]
         return kept
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
@@ -87,7 +54,7 @@ class _Travels:
         self.maze = self._program.env
         if self._state is not None:
             blank, structure = jax.tree.flatten(self._program.blank)
-            leaves = [_like(one, array) for one, array in zip(blank, self._state, strict=True)]
+            leaves = [like(one, array) for one, array in zip(blank, self._state, strict=True)]
             self._state = jax.tree.unflatten(structure, leaves)
 
 
@@ -134,14 +101,14 @@ class GymEnv(_Travels, gymnasium.Env[Observation, np.ndarray]):
         super().reset(seed=plain(seed))
         everyone = np.ones(1, bool)
         self._state, array = self._program.begin(self._program.blank, everyone, _bits([self.np_random]))
-        record = _read(self.maze, array)
+        record = read(self.maze, array)
         return _first(goals(self.maze, record.obs)), _first(_info(self.maze, record.obs))
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, Info]:
         """One env step; `action` [action_size] is clipped to [-1, 1]."""
         action = _checked_action(action, self.action_space)[None]
         self._state, array = self._program.step(_started(self._state), action)
-        record = _read(self.maze, array)
+        record = read(self.maze, array)
         observation = goals(self.maze, record.obs)
         reward = compute_reward(self.maze, observation["achieved_goal"], observation["desired_goal"])
         (truncated,), (done,) = record.truncated.tolist(), record.done.tolist()
@@ -226,7 +193,7 @@ class GymVectorEnv(_Travels, gymnasium.vector.VectorEnv[Observation, np.ndarray,
         """One env step of every environment; `actions` [B, action_size] are clipped to [-1, 1]."""
         actions = _checked_action(actions, self.action_space)
         self._state, array = self._program.step(_started(self._state), actions)
-        record, everyone = _read(self.maze, array), np.ones(self.num_envs, bool)
+        record, everyone = read(self.maze, array), np.ones(self.num_envs, bool)
         reached, done = goals(self.maze, record.obs), record.done
         rewards = compute_reward(self.maze, reached["achieved_goal"], reached["desired_goal"]).astype(np.float64)
         flags = (done & ~record.truncated, record.truncated)
@@ -242,7 +209,7 @@ class GymVectorEnv(_Travels, gymnasium.vector.VectorEnv[Observation, np.ndarray,
     def _begin(self, state: Any, mask: np.ndarray) -> np.ndarray:
         """Begin new episodes where the mask says so; returns all observations [B, n]."""
         self._state, array = self._program.begin(state, mask, self._drawn(mask))
-        return _read(self.maze, array).obs
+        return read(self.maze, array).obs
 
     def _drawn(self, mask: np.ndarray) -> np.ndarray:
         """Random bits for the environments of the mask: a generator that they do not share draws for them alone."""
@@ -262,77 +229,6 @@ class GymVectorEnv(_Travels, gymnasium.vector.VectorEnv[Observation, np.ndarray,
             return _nothing_to_render()
         state = _started(self._state)
         return tuple(_picture(self.maze, state, i, self._picture) for i in range(self.num_envs))
-
-
-_begun: list[int] = []  # the process that has compiled, and with it those forked from it
-
-
-def _check_process() -> None:
-    """Raise `EnvError` in a process that was forked from one in which JAX had begun: it would wait for ever."""
-    if not _begun:
-        _begun.append(os.getpid())
-    if _begun[0] != os.getpid():
-        raise envs.EnvError(
-            'this process was forked from one that runs JAX, and would hang; start it by "spawn" or "forkserver", as '
-            'AsyncVectorEnv does with context="forkserver", or make the batch with gymnasium.make_vec'
-        )
-
-
-def program(task: str, options: dict[str, Any], num_envs: int) -> Program:
-    """The program of a batch, compiled at most once; raises `EnvError` if the options are wrong."""
-    _check_process()
-    options = normal(options)
-    arena = envs.make(task, **options).arena  # the file of a map may have changed
-    return _compiled(task, arena, num_envs, **dict(sorted(options.items())))
-
-
-@lru_cache(maxsize=PROGRAMS)
-def _compiled(task: str, arena: Arena, num_envs: int, **options: Any) -> Program:
-    env = envs.make(task, **options)
-    vector = envs.VectorEnv(env, num_envs, auto_reset=False)
-
-    def begin(state: Any, mask: jax.Array, bits: jax.Array) -> tuple[Any, jax.Array]:
-        return recorded(vector.reset_where(state, mask, keys(bits)))
-
-    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-        return recorded(vector.step(state, action))
-
-    def keys(bits: jax.Array) -> jax.Array:
-        key = jax.random.wrap_key_data(bits, impl=modes.KEYS)
-        return jax.vmap(lambda one: jax.random.split(one, num_envs // len(bits)))(key).reshape(num_envs)
-
-    def recorded(state: Any) -> tuple[Any, jax.Array]:
-        fault = jnp.maximum(state.metrics["non_finite"], state.metrics["overflow"])
-        flags = jnp.stack([state.done, state.info["truncation"], fault], axis=-1)
-        return state, jnp.concatenate([state.obs, flags], axis=-1)
-
-    shapes = jax.eval_shape(lambda bits: vector.reset(keys(bits)), jax.ShapeDtypeStruct((1, 2), jnp.uint32))
-    blank = jax.jit(lambda: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
-    return Program(env=env, blank=blank(), begin=jax.jit(begin), step=jax.jit(step))
-
-
-def spaces(env: MazeEnv) -> tuple[gymnasium.Space[Any], Box]:
-    """The spaces of one environment's observations and actions."""
-    goal = len(env.goal_indices)
-    sizes = {"observation": env.state_dim, "achieved_goal": goal, "desired_goal": goal}
-    observations = Dict({name: Box(-LARGEST, LARGEST, (size,), np.float32) for name, size in sizes.items()})
-    return observations, Box(-1.0, 1.0, (env.action_size,), np.float32)
-
-
-def goals(env: MazeEnv, obs: np.ndarray) -> Observation:
-    """Gymnasium's dictionary of observations [..., n], in arrays of their own."""
-    return {
-        "observation": obs[..., : env.state_dim].copy(),
-        "achieved_goal": obs[..., list(env.goal_indices)],
-        "desired_goal": obs[..., env.state_dim :].copy(),
-    }
-
-
-def compute_reward(env: MazeEnv, achieved: np.ndarray, desired: np.ndarray) -> Any:
-    """The reward [...] for goals [..., k]. One pair of goals is rewarded as a batch of one: NumPy rounds alike."""
-    achieved, desired = np.asarray(achieved), np.asarray(desired)
-    pairs = (goal.reshape(-1, len(env.goal_indices)) for goal in (achieved, desired))
-    return env.reward(*pairs).reshape(achieved.shape[:-1])[()]
 
 
 def _info(env: MazeEnv, obs: np.ndarray, fault: np.ndarray | None = None) -> Info:
@@ -365,22 +261,6 @@ def _masked(info: Info, mask: np.ndarray) -> Info:
     return values | {f"_{key}": mask.copy() for key in info}
 
 
-def _raw(leaf: jax.Array) -> jax.Array:
-    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-
-
-def _like(leaf: jax.Array, array: np.ndarray) -> jax.Array:
-    """`array` on a device, as a key where `leaf` is one."""
-    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        return jax.random.wrap_key_data(jnp.asarray(array), impl=jax.random.key_impl(leaf))
-    return jnp.asarray(array)
-
-
-def _bits(generators: Sequence[np.random.Generator]) -> np.ndarray:
-    """64 random bits of each generator: uint32 [n, 2]."""
-    return np.stack([generator.integers(2**32, size=2, dtype=np.uint32) for generator in generators])
-
-
 def _seeded(seeds: list[Any], old: list[np.random.Generator] | None, num_envs: int) -> list[np.random.Generator]:
     """A generator for each seed; where that is None the old one, if there is any."""
     if len(seeds) != num_envs:
@@ -388,12 +268,6 @@ def _seeded(seeds: list[Any], old: list[np.random.Generator] | None, num_envs: i
     if old is None:
         old = [seeding.np_random()[0] for _ in seeds]
     return [one if seed is None else seeding.np_random(seed)[0] for seed, one in zip(seeds, old, strict=True)]
-
-
-def _read(env: MazeEnv, array: jax.Array) -> Record:
-    host = np.asarray(array)
-    done, truncated, fault = host[:, env.observation_size :].T > 0
-    return Record(host[:, : env.observation_size], done, truncated, fault)
 
 
 def _checked_action(action: Any, space: gymnasium.Space[Any]) -> np.ndarray:
@@ -421,12 +295,6 @@ def _checked_mode(mode: str | None) -> str | None:
     return mode
 
 
-def _started(state: Any) -> Any:
-    if state is None:
-        raise ResetNeeded("the environment has not been reset")
-    return state
-
-
 def _nothing_to_render() -> None:
     gymnasium.logger.warn(f'nothing is rendered: make the environment with render_mode="{RENDER_MODE}"')
 
@@ -437,3 +305,14 @@ def _picture(env: MazeEnv, state: Any, i: int, picture: dict[str, Any]) -> np.nd
     goal = np.asarray(state.obs[i, env.state_dim :])
     data = jax.tree.map(lambda leaf: leaf[i], state.pipeline_state.data)
     return render.frame(env, data, marks=render.Marks(goal=goal), **picture)
+
+
+def _bits(generators: Sequence[np.random.Generator]) -> np.ndarray:
+    """64 random bits of each generator: uint32 [n, 2]."""
+    return np.stack([generator.integers(2**32, size=2, dtype=np.uint32) for generator in generators])
+
+
+def _started(state: Any) -> Any:
+    if state is None:
+        raise ResetNeeded("the environment has not been reset")
+    return state

@@ -22,7 +22,8 @@ from flax import struct
 
 from envs._quiet import Env, State
 from envs.arena import Arena
-from envs.tasks import Places, Switch, Task
+from envs.places import Places
+from envs.tasks import Switch, Task
 
 
 class Body(Protocol):

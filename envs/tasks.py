@@ -14,10 +14,8 @@ import numpy as np
 from envs import arena as arenas
 from envs.arena import BLOCK, CELL_SIZES, CHASM, FREE, GATE, GOAL, ROBOT, Arena
 from envs.options import EnvError, Option, choice, count, duration, number
+from envs.places import Places, Point, anywhere, around, box, centres, point, scaled
 
-Point = tuple[float, ...]
-
-CLEARANCE = {"ant": 1.0, "point": 0.6}  # m that a body keeps from the sides of a cell when it starts anywhere
 INTEGRATORS = ("implicitfast", "euler", "rk4")
 SOLVERS = ("newton", "cg")
 CONES = ("pyramidal", "elliptic")
@@ -29,25 +27,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 10},
     "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},
 }
-
-
-@dataclass(frozen=True)
-class Places:
-    """A distribution of points: uniform over a union of boxes, or over their corners if all are points.
-
-    `lower` and `upper` are corners of the boxes, in m. A box is chosen by its volume, each with the same probability
-    if none has any.
-    """
-
-    lower: tuple[Point, ...]
-    upper: tuple[Point, ...]
-
-    def resized(self, ratio: float) -> Places:
-        """All places `ratio` times as far from the origin in x and y."""
-        return Places(
-            tuple(_scaled(corner, ratio) for corner in self.lower),
-            tuple(_scaled(corner, ratio) for corner in self.upper),
-        )
 
 
 @dataclass(frozen=True)
@@ -70,9 +49,9 @@ class Geometry:
         ratios = [ratio if i in (0, 1) else 1.0 for i in self.abstract_indices]
         return replace(
             self,
-            space=(_scaled(lower, ratio), _scaled(upper, ratio)),
+            space=(scaled(lower, ratio), scaled(upper, ratio)),
             region_cuts=tuple(tuple(r * cut for cut in cuts) for r, cuts in zip(ratios, self.region_cuts, strict=True)),
-            subgoal_scale=_scaled(self.subgoal_scale, ratio),
+            subgoal_scale=scaled(self.subgoal_scale, ratio),
         )
 
 
@@ -90,7 +69,7 @@ class Switch:
 
     def resized(self, ratio: float) -> Switch:
         """The same switch at `ratio` times the size."""
-        return replace(self, lower=_scaled(self.lower, ratio), upper=_scaled(self.upper, ratio))
+        return replace(self, lower=scaled(self.lower, ratio), upper=scaled(self.upper, ratio))
 
 
 @dataclass(frozen=True)
@@ -147,11 +126,6 @@ class Task:
         return options | {key: replace(options[key], default=value) for key, value in self.defaults.items()}
 
 
-def _scaled(point: Point, ratio: float) -> Point:
-    """`point` with x and y, its first two coordinates, `ratio` times as large."""
-    return (ratio * point[0], ratio * point[1], *point[2:])
-
-
 MAP = Option(None, lambda value: isinstance(value, str) and bool(value), "the path of a map, or its rows")
 
 COMMON: Mapping[str, Option] = {
@@ -177,36 +151,6 @@ ANT: Mapping[str, Option] = {
     "iterations": count(None, 10_000),
     "ls_iterations": count(None, 10_000),
 }
-
-
-def box(lower: Point, upper: Point) -> Places:
-    """Uniform in one box."""
-    return Places((lower,), (upper,))
-
-
-def point(*coordinates: float) -> Places:
-    """Always the same point."""
-    return box(coordinates, coordinates)
-
-
-def centres(arena: Arena, symbols: str) -> Places:
-    """The centres of the cells that hold one of `symbols`, all alike."""
-    found = tuple(tuple(map(float, centre)) for centre in arena.centres(symbols))
-    return Places(found, found)
-
-
-def around(arena: Arena, symbols: str, *, clearance: float, height: Point = ()) -> Places:
-    """Anywhere in the cells that hold one of `symbols`, `clearance` m from their sides; `height` is appended."""
-    half = max(arena.cell / 2 - clearance, 0.0)
-    found = [tuple(map(float, centre)) for centre in arena.centres(symbols)]
-    return Places(
-        tuple((x - half, y - half, *height) for x, y in found), tuple((x + half, y + half, *height) for x, y in found)
-    )
-
-
-def anywhere(body: str, arena: Arena) -> Places:
-    """Anywhere in the free cells, clear of their sides."""
-    return around(arena, FREE + ROBOT + GOAL, clearance=CLEARANCE[body])
 
 
 def plane(arena: Arena) -> Geometry:

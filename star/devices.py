@@ -116,7 +116,7 @@ def join(cluster: str) -> None:
         if number >= count:
             raise ConfigError(f"--distributed: process {number} is not among those of {count}: 0 to {count - 1}")
         known = {"coordinator_address": address, "process_id": number, "num_processes": count}
-    jax.config.update("jax_enable_preemption_service", False)  # SIGTERM is heard by `star.stopping`
+    jax.config.update("jax_enable_preemption_service", False)  # SIGTERM is heard by `star.training.signals`
     try:
         jax.distributed.initialize(**known)
     except (RuntimeError, ValueError) as error:

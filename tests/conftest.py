@@ -28,13 +28,13 @@ import envs  # noqa: E402
 from envs import arena, opengl  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
-from star import loading  # noqa: E402
-from star import program as programs  # noqa: E402
 from star.agent import commander, controller, levels, play, tutor  # noqa: E402
 from star.agent.decisions import Roadmap  # noqa: E402
-from star.checkpoint import Checkpoints  # noqa: E402
-from star.config.run import TrainerConfig  # noqa: E402
+from star.agent.sections import StarTrainerConfig  # noqa: E402
+from star.config import loading  # noqa: E402
 from star.spec import Spec  # noqa: E402
+from star.training import program as programs  # noqa: E402
+from star.training.checkpoint import Checkpoints  # noqa: E402
 from tests.browser import program, started
 
 # What is imported and traced stays: to look through it for garbage again and again is a tenth of all time.
@@ -137,8 +137,8 @@ def compiled_once():
         if key not in known:
             known[key] = build(config)
         program = known[key]
-        resolved = programs.resolve(config, program.config.env.engine, program.spec)
-        return replace(program, config=resolved, agent=resolved.agent())
+        resolved = program.experiment.resolve(config)
+        return replace(program, config=resolved, hyper=resolved.hyper())
 
     programs.build = shared
     yield
@@ -147,6 +147,8 @@ def compiled_once():
 
 def compiled(config):
     """The structure of `config`, whatever the loop around its program does; None if it depends on files."""
+    if config.experiment != "star":
+        return None
     learners = any(":" in level.learner for _, level, _ in config.learners())
     if learners or any(teacher.source != "map" for teacher in config.sgim.teachers):
         return None
@@ -155,7 +157,7 @@ def compiled(config):
     except (envs.EnvError, TypeError, AttributeError):
         return None
     names = ("num_envs", "eval_episodes", "device", "devices")
-    trainer = TrainerConfig(**{name: getattr(config.trainer, name) for name in names})
+    trainer = StarTrainerConfig(**{name: getattr(config.trainer, name) for name in names})
     return programs.structure(config.model_copy(update={"env": config.env.model_copy(update=maps), "trainer": trainer}))
 
 
@@ -193,7 +195,7 @@ def run(tmp_path_factory):
     state = state.replace(controller=state.controller.replace(params=strong))
     (run_dir / "config.yaml").write_text(program.config.to_yaml())
     checkpoints = Checkpoints(run_dir)
-    checkpoints.save(160, state, program.config, success=0.0)
+    checkpoints.save(160, state, program.config, score=0.0)
     checkpoints.close()
     return run_dir
 
@@ -297,7 +299,7 @@ def recording(request, breaking_env):
         "commander.epsilon_spread": False,
     }
     parsed = loading.parse(TINY, overrides)
-    agent, spec = parsed.agent(), Spec.of(breaking_env.env)
+    agent, spec = parsed.hyper(), Spec.of(breaking_env.env)
 
     def whole(key):
         state = levels.init(agent, spec, key=key)

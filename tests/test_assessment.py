@@ -11,11 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import assessment, checkpoint, cli, loading, rendering, report, tables
-from star import program as programs
+from star import cli
+from star.agent import exam_results, exam_tables, exams, films
+from star.agent.exams import Exam, Target
 from star.agent.play import Episode
-from star.assessment import Exam, Target
-from star.checkpoint import Checkpoints, load_state
+from star.config import loading
+from star.report import history
+from star.training import checkpoint
+from star.training import program as programs
+from star.training.checkpoint import Checkpoints, load_state
 
 GRID = Exam(grid=2, seed=1)
 EPISODES = 5
@@ -35,10 +39,10 @@ def still(run, tmp_path_factory):
     (copy / "config.yaml").write_text(program.config.to_yaml())
     state = load_state(programs.build(loading.load(run / "config.yaml")), run, "last")[1]
     checkpoints = Checkpoints(copy)
-    checkpoints.save(160, state, program.config, success=1.0)
+    checkpoints.save(160, state, program.config, score=1.0)
     weak = jax.tree.map(lambda x: 0 * x, state.controller.params)
     still = state.replace(controller=state.controller.replace(params=weak))
-    checkpoints.save(320, still, program.config, success=0.5)
+    checkpoints.save(320, still, program.config, score=0.5)
     checkpoints.close()
     return copy
 
@@ -46,7 +50,7 @@ def still(run, tmp_path_factory):
 @pytest.fixture(scope="module")
 def evaluated(run, still):
     """The rows of both runs on a grid of goals, how often the episode was traced, and the trials of every row."""
-    traced, play, trials, row = [], assessment.greedy, [], assessment._row
+    traced, play, trials, row = [], exams.greedy, [], exams._row
 
     def kept(entry, exam, played, shortest):
         trials.append(played)
@@ -57,10 +61,10 @@ def evaluated(run, still):
         return play(*arguments, **how)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(assessment, "greedy", counted)
-        patch.setattr(assessment, "_row", kept)
+        patch.setattr(exams, "greedy", counted)
+        patch.setattr(exams, "_row", kept)
         targets = [Target(run, "last", config_of(run)), Target(still, "all", config_of(still))]
-        rows = assessment.evaluate([*targets, Target(still, "best", config_of(still))], GRID)
+        rows = exams.evaluate([*targets, Target(still, "best", config_of(still))], GRID)
     return rows, len(traced), trials
 
 
@@ -104,7 +108,7 @@ def test_intervals_are_over_episodes_for_a_seed_and_over_seeds_besides(evaluated
 
 def test_the_episode_of_a_number_is_recorded_as_it_was_evaluated(evaluated, still):
     rows, _, (_, trials, _) = evaluated
-    recorded = rendering.record_run(
+    recorded = films.record_run(
         config_of(still), still, checkpoint="160", agent=9, envs=1, steps=None, exam=GRID, number=1
     ).moments
     np.testing.assert_array_equal(recorded.obs[0, 0, 4:], [14, 2])
@@ -118,7 +122,7 @@ def test_time_and_way_count_until_the_goal_is_first_reached():
     position = rng.normal(size=(7, 40, 2)).cumsum(axis=0)
     success = (rng.random((7, 40)) < 0.15).astype(float)
     ended = Episode.start(40)
-    found = assessment.measure(ended, jnp.asarray(position), jnp.asarray(success), goal=jnp.zeros((40, 2)))
+    found = exams.measure(ended, jnp.asarray(position), jnp.asarray(success), goal=jnp.zeros((40, 2)))
     for e in range(40):
         steps, path = 0, 0.0
         for t in range(1, 7):
@@ -130,19 +134,19 @@ def test_time_and_way_count_until_the_goal_is_first_reached():
 
 
 def test_the_shortest_way_ends_where_the_goal_counts_as_reached(run):
-    course = assessment.prepare(config_of(run), Exam(), episodes=1, source=run)
-    trials = assessment.measure(Episode.start(2), jnp.zeros((2, 2, 2)), jnp.zeros((2, 2)), goal=jnp.zeros((2, 2)))
+    course = exams.prepare(config_of(run), Exam(), episodes=1, source=run)
+    trials = exams.measure(Episode.start(2), jnp.zeros((2, 2, 2)), jnp.zeros((2, 2)), goal=jnp.zeros((2, 2)))
     trials = trials.replace(goal=np.array([[0.0, 16.0], [3.0, 0.0]]))
-    np.testing.assert_allclose(assessment.shortest_ways(course, trials), [2 * np.hypot(12, 4) + 8 - 5, 0.0])
+    np.testing.assert_allclose(exams.shortest_ways(course, trials), [2 * np.hypot(12, 4) + 8 - 5, 0.0])
 
 
 def test_in_another_task_an_agent_keeps_its_regions_and_meets_other_goals_and_clocks(run):
     task = {"env.name": "point_4rooms", "env.options.episode_length": 60}
-    course = assessment.prepare(config_of(run), Exam(task=task), episodes=1, source=run)
+    course = exams.prepare(config_of(run), Exam(task=task), episodes=1, source=run)
     assert (course.env.name, course.spec.episode_length, course.options) == ("point_4rooms", 60, {"episode_length": 60})
-    assert course.spec.space == course.program.spec.space != tuple(tuple(x) for x in course.env.space)
+    assert course.spec.space == course.program.experiment.spec.space != tuple(tuple(x) for x in course.env.space)
     assert course.spec.success_radius == 2.5
-    same = assessment.elsewhere(config_of(run), {"env.options.reward": "sparse"})
+    same = exams.elsewhere(config_of(run), {"env.options.reward": "sparse"})
     assert same.env.options == {"episode_length": 40, "reward": "sparse"}
 
 
@@ -191,15 +195,15 @@ def test_a_damaged_checkpoint_is_told_in_one_line(run, tmp_path, capsys, damage,
 def test_the_folder_of_an_evaluation_holds_its_rows_and_a_figure_for_everything_in_them(evaluated, run, tmp_path):
     rows, *_ = evaluated
     groups = {"mo$\\frac$ing": [run], "still": [Path(rows[-1]["run"])]}
-    comparison = assessment.compare(rows, groups)
+    comparison = exam_results.compare(rows, groups)
     assert comparison["groups"][1]["success_any"]["scores"] == {
         'point_maze {"episode_length": 40}': [seed["success_any"] for seed in rows[2]["seeds"]]
     }
-    elsewhere = assessment.compare([*rows[:-1], rows[-1] | {"env": "ant_maze"}], groups)
-    captions = [tables.improvements(found["improvement"]).caption for found in (comparison, elsewhere)]
+    elsewhere = exam_results.compare([*rows[:-1], rows[-1] | {"env": "ant_maze"}], groups)
+    captions = [exam_tables.improvements(found["improvement"]).caption for found in (comparison, elsewhere)]
     assert captions == [None, "-: no task in common"]
     (tmp_path / "goals-old.png").write_text("of an earlier evaluation")
-    written = assessment.write(tmp_path, rows, comparison)
+    written = exam_results.write(tmp_path, rows, comparison)
     names = {"evaluation.jsonl", "goals-new.png", "goals-still.png", "curve.png", "profile.png"}
     assert {path.name for path in written} == {path.name for path in tmp_path.iterdir()} == names
     lines = (tmp_path / "evaluation.jsonl").read_text().splitlines()
@@ -208,10 +212,10 @@ def test_the_folder_of_an_evaluation_holds_its_rows_and_a_figure_for_everything_
 
 def test_runs_are_called_by_their_folders_unless_two_are_called_the_same():
     runs = [Path("a/x"), Path("b/x"), Path("c/y")]
-    assert report.labels(runs) == ["a/x", "b/x", "y"]
+    assert history.labels(runs) == ["a/x", "b/x", "y"]
 
 
 def test_one_task_has_one_name_however_it_is_spelt():
-    name = assessment._task
+    name = exam_results._task
     assert name("maze", {"cell": 4.0, "map": "111\n1r1\n"}) == name("maze", {"map": "111\n1r1\n\n", "cell": 4})
     assert name("maze", {"cell": 4.5}) != name("maze", {"cell": 4}) != name("maze", {})

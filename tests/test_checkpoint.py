@@ -14,10 +14,13 @@ import numpy as np
 import pytest
 
 from envs.common.errors import UserError
-from star import checkpoint, migrations
+from star.agent.kind import STAR
+from star.agent.migrations import FORMAT
 from star.agent.sections import Config
-from star.checkpoint import Checkpoints, Damaged, best, choose, kept, newest
-from star.migrations import FORMAT, Migration, migrated_arrays
+from star.config import kinds
+from star.config.kinds import Migration
+from star.training import checkpoint
+from star.training.checkpoint import Checkpoints, Damaged, best, choose, kept, newest
 from tests.small import unpacked
 
 ROOT = Path(__file__).parents[1]
@@ -33,7 +36,7 @@ def written(tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("written")
     checkpoints = Checkpoints(run_dir)
     for step, success in ((10, 0.9), (20, 0.1), (30, 0.2)):
-        checkpoints.save(step, state(step), Config(), success=success)
+        checkpoints.save(step, state(step), Config(), score=success)
     checkpoints.close()
     return run_dir
 
@@ -110,24 +113,24 @@ def test_the_last_checkpoint_falls_back_in_one_line_and_any_other_is_refused(che
 
 def test_which_checkpoint_is_best_is_not_guessed_and_saving_goes_on_all_the_same(checkpoints, tmp_path):
     (folder(checkpoints, 10) / "about.json").write_text("{")
-    with pytest.raises(Damaged, match="/10: is damaged, its success cannot be read"):
+    with pytest.raises(Damaged, match="/10: is damaged, its success_final cannot be read"):
         choose(checkpoints, tmp_path, "best")
-    checkpoints.save(40, state(40), Config(), success=0.0)
+    checkpoints.save(40, state(40), Config(), score=0.0)
     assert checkpoints.steps() == [20, 30, 40]
 
 
 def test_a_damaged_checkpoint_set_aside_stays_until_its_step_is_saved_again(checkpoints):
     aside = checkpoints.set_aside(30)
     assert checkpoints.steps() == [10, 20] and aside.name == "30.damaged" and files(aside)
-    checkpoints.save(25, state(25), Config(), success=0.0)
+    checkpoints.save(25, state(25), Config(), score=0.0)
     assert aside.exists()
-    checkpoints.save(30, state(31), Config(), success=0.0)
+    checkpoints.save(30, state(31), Config(), score=0.0)
     assert not aside.exists()
     np.testing.assert_array_equal(checkpoints.restore(30, state(0))["x"], np.full(300, 31.0))
 
 
 def test_a_checkpoint_saved_again_replaces_the_old_one(checkpoints):
-    checkpoints.save(30, state(99), Config(), success=0.0)
+    checkpoints.save(30, state(99), Config(), score=0.0)
     checkpoints.check(30)
     np.testing.assert_array_equal(checkpoints.restore(30, state(0))["x"], np.full(300, 99.0))
 
@@ -136,7 +139,7 @@ def test_what_a_killed_process_had_not_finished_is_no_checkpoint_and_goes_with_t
     for name in (".40.partial", ".20.removed"):
         shutil.copytree(folder(checkpoints, 20), checkpoints._path / name)
     assert checkpoints.steps() == [10, 20, 30]
-    checkpoints.save(40, state(40), Config(), success=0.0)
+    checkpoints.save(40, state(40), Config(), score=0.0)
     assert {entry.name for entry in checkpoints._path.iterdir()} == {"10", "20", "30", "40"}
 
 
@@ -150,7 +153,7 @@ def test_the_name_of_a_checkpoint_appears_after_its_files_are_on_the_disk(checkp
 
     monkeypatch.setattr(checkpoint.files, "sync", lambda path: (done.append(("sync", path.name)), sync(path)))
     monkeypatch.setattr(checkpoint.os, "rename", noting_rename)
-    checkpoints.save(40, state(40), Config(), success=0.0)
+    checkpoints.save(40, state(40), Config(), score=0.0)
     appears = done.index(("rename", "40"))
     synced = [name for kind, name in done[:appears] if kind == "sync"]
     everything = [entry.name for entry in folder(checkpoints, 40).rglob("*")]
@@ -173,7 +176,7 @@ def test_a_checkpoint_that_cannot_be_written_is_told_in_one_line_and_leaves_no_t
 
     monkeypatch.setattr(checkpoint, "_sums", fail)
     with pytest.raises(UserError) as error:
-        checkpoints.save(40, state(40), Config(), success=0.0)
+        checkpoints.save(40, state(40), Config(), score=0.0)
     assert f"/40: cannot be written: {told}" in str(error.value) and "\n" not in str(error.value)
     monkeypatch.undo()
     assert {entry.name for entry in checkpoints._path.iterdir()} == {"10", "20", "30"}
@@ -185,11 +188,13 @@ def test_a_full_disk_and_one_that_is_read_only_leave_older_checkpoints_and_whole
     script = """
 import sys, subprocess, numpy as np
 from pathlib import Path
-from star.checkpoint import Checkpoints
+from star.training.checkpoint import Checkpoints
 from star.agent.sections import Config
+from star.config import kinds
+from star.config.kinds import Migration
 from envs.common.errors import UserError
-from star.lock import locked
-from star.metrics import JsonLines
+from star.training.lock import locked
+from star.training.journal import JsonLines
 run = Path("disk/run")
 run.mkdir()
 checkpoints, lines = Checkpoints(run), JsonLines(run / "metrics.jsonl")
@@ -201,9 +206,9 @@ def fails(action):
     checkpoints.check(10)
     assert checkpoints.steps() == [10] and all(row == {"env_steps": 1} for row in lines.read())
 random = np.random.default_rng(0).random
-checkpoints.save(10, {"x": random(10_000)}, Config(), success=0.0)
+checkpoints.save(10, {"x": random(10_000)}, Config(), score=0.0)
 lines.write({"env_steps": 1})
-fails(lambda: checkpoints.save(20, {"x": random(400_000)}, Config(), success=0.0))
+fails(lambda: checkpoints.save(20, {"x": random(400_000)}, Config(), score=0.0))
 def fill():
     while True:
         lines.write({"env_steps": 1})
@@ -211,7 +216,7 @@ Path("disk/other").write_bytes(bytes(1_500_000))
 fails(fill)
 assert lines.path.read_bytes().endswith(b"}\\n")
 subprocess.run(["mount", "-o", "remount,ro", "disk"], check=True)
-fails(lambda: checkpoints.save(30, {"x": random(10)}, Config(), success=0.0))
+fails(lambda: checkpoints.save(30, {"x": random(10)}, Config(), score=0.0))
 fails(lambda: lines.write({"env_steps": 1}))
 fails(lambda: locked(run, warn=print).__enter__())
 """
@@ -259,9 +264,8 @@ def test_an_older_format_is_brought_up_step_by_step(checkpoints, monkeypatch):
         FORMAT: Migration(rename, lambda arrays: {("y" if name == "x" else name): x for name, x in arrays.items()}),
         FORMAT + 1: Migration(arrays=lambda arrays: arrays | {"y": 2 * arrays["y"]}),
     }
-    monkeypatch.setattr(migrations, "TO_NEXT", rows)
-    for module in (migrations, checkpoint):
-        monkeypatch.setattr(module, "FORMAT", FORMAT + 2)
+    later = STAR._replace(format=FORMAT + 2, migrations=rows)
+    monkeypatch.setattr(kinds, "find", lambda name: later)
     assert checkpoints.config(20).env.name == Config().env.name
     wanted = {"y": jnp.zeros(300), "pair": (jnp.zeros(3, jnp.int32), None)}
     found = checkpoints.restore(20, wanted)
@@ -284,7 +288,7 @@ def test_what_is_read_of_an_older_format_is_what_was_written(name, tmp_path):
     assert checkpoints.config(480).trainer.num_seeds == 2
     arrays = checkpoints.arrays(480)
     assert arrays["epoch"].tolist() == [2, 2] and arrays["tutor/params/actor/params/Dense_0/kernel"].shape == (2, 8, 8)
-    before, after = (x["commander/model/led"] for x in (arrays, migrated_arrays(arrays, int(name[-1]))))
+    before, after = (x["commander/model/led"] for x in (arrays, STAR.migrated_arrays(arrays, int(name[-1]))))
     assert before.any() and (after == before[:, None]).all()  # of seeds, then of aims, which were counted together
     assert after.shape == (2, 2, *before.shape[1:])
     checkpoints.close()

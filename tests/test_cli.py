@@ -10,10 +10,12 @@ import pytest
 
 import envs
 from envs.common.errors import UserError
-from star import assessment, tables, trainer
+from star.agent import exam_tables, exams
 from star.agent.sections import Config
-from star.cli import main, split_settings
-from star.loading import fields
+from star.cli import main
+from star.cli.words import split_settings
+from star.config.loading import fields
+from star.training import trainer
 
 ROOT = Path(__file__).parents[1]
 
@@ -55,7 +57,7 @@ def calls(monkeypatch):
         return [evaluation(str(target.run_dir), env_steps=10) for target in targets]
 
     monkeypatch.setattr(trainer, "train", train)
-    monkeypatch.setattr(assessment, "evaluate", evaluate)
+    monkeypatch.setattr(exams, "evaluate", evaluate)
     return calls
 
 
@@ -70,7 +72,7 @@ def evaluation(run, *, env_steps):
 
 def test_a_table_names_runs_as_they_are_called(capsys):
     names = ["[red]a[/red]", ":smile:", "<script>"]
-    tables.show([evaluation(name, env_steps=10) for name in names], None, again="")
+    exam_tables.show([evaluation(name, env_steps=10) for name in names], None, again="")
     shown = capsys.readouterr().out
     assert all(name in shown for name in names)
 
@@ -370,15 +372,15 @@ def test_help_shows_how_to_train_resume_and_evaluate(capsys, arguments):
 def test_settings_lists_every_key_with_its_default(capsys):
     assert main(["settings"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == [key for key, _, _ in fields()]
-    for line, (_, default, description) in zip(lines, fields(), strict=True):
+    assert [line.split()[0] for line in lines] == [key for key, _, _ in fields(Config)]
+    for line, (_, default, description) in zip(lines, fields(Config), strict=True):
         assert line.endswith(f"{description} (default {json.dumps(default)})")
 
 
 def test_settings_can_be_narrowed_down(capsys):
     assert main(["settings", "tutor.ppo"]) == 0
     keys = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
-    assert keys == [key for key, _, _ in fields() if key.startswith("tutor.ppo.")]
+    assert keys == [key for key, _, _ in fields(Config) if key.startswith("tutor.ppo.")]
 
 
 def test_envs_lists_every_task(capsys):
@@ -420,7 +422,7 @@ def test_a_setting_without_a_value_is_refused():
 
 
 def test_the_program_itself_prints_help_and_no_warnings():
-    command = [sys.executable, "-W", "default", "-m", "star.cli", "--help"]
+    command = [sys.executable, "-W", "default", "-m", "star", "--help"]
     where = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | where, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")

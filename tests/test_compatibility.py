@@ -29,16 +29,19 @@ from rich.console import Console
 import envs
 from envs.common import reading
 from envs.common.errors import UserError
-from star import cli, report, sgim
-from star import program as programs
+from star import cli, sgim
 from star.abstraction import regions
-from star.checkpoint import differences
-from star.loading import parse
+from star.agent.experiment import make_env
+from star.cli.streams import unbroken
+from star.cli.words import new_place, split_settings, typed
+from star.config.loading import parse
 from star.sgim import teachers
 from star.spec import Spec
-from star.stopping import interruptible
-from star.streams import unbroken
-from star.study import sqlalchemy_url, sqlite_url
+from star.sweeps.ledger import sqlalchemy_url, sqlite_url
+from star.training import program as programs
+from star.training.compatibility import differences
+from star.training.figures import literal
+from star.training.signals import interruptible
 from tests.scripts import load
 
 ROOT = Path(__file__).parents[1]
@@ -135,7 +138,7 @@ def test_options_take_what_their_plain_twins_take(name, value, plain):
 def test_rows_of_a_map_are_its_text_in_a_run_and_in_gymnasium(rows):
     text = "\n".join(ROWS) + "\n"
     config = parse({"env": {"options": {"map": rows}}})
-    resolved = programs.resolve(config, "jax", Spec.of(programs.make_env(config, "test")))
+    resolved = programs.build(config).config
     assert resolved.env.options["map"] == text
     made = gymnasium.make("star/PointMaze-v0", map=rows, episode_length=np.array(20)).unwrapped
     assert made.maze.arena == envs.make("point_maze", map=text).arena
@@ -205,7 +208,7 @@ def test_goal_selection_alone_refuses_the_modes_that_environments_refuse(mode):
 
 
 def test_printed_commands_can_be_typed(tmp_path):
-    assert cli._typed(Path("runs/a b")) == "'runs/a b'" and cli._typed(Path("runs/ab")) == "runs/ab"
+    assert typed(Path("runs/a b")) == "'runs/a b'" and typed(Path("runs/ab")) == "runs/ab"
     (tmp_path / "a b").mkdir()
     (tmp_path / "a b" / "x").touch()
     command = ["train", str(ROOT / "configs/point_maze.yaml"), "--run-dir", str(tmp_path / "a b")]
@@ -231,7 +234,7 @@ def test_numbers_are_those_that_people_mean(text, value, tmp_path):
 
 
 def test_a_padded_seed_is_that_seed_and_a_time_is_no_number(tmp_path, capsys):
-    found, _ = cli.split_settings(["--trainer.seed", "010"]), None
+    found, _ = split_settings(["--trainer.seed", "010"]), None
     assert parse({}, found[1]).trainer.seed == 10
     command = ["train", str(ROOT / "configs/point_maze.yaml"), "--run-dir", str(tmp_path / "run")]
     assert cli.main([*command, "--total-env-steps", "1:30:00"]) == 2
@@ -308,7 +311,7 @@ def test_a_folder_that_orbax_takes_for_a_pattern_is_refused(name, tmp_path, caps
 
 
 def test_two_commands_in_one_second_get_a_place_each(tmp_path):
-    places = {cli._new(tmp_path / "runs", "maze") for _ in range(3)}
+    places = {new_place(tmp_path / "runs", "maze") for _ in range(3)}
     assert len(places) == 3 and all(place.is_dir() for place in places)
 
 
@@ -324,7 +327,7 @@ def test_a_run_knows_its_teachers_file_by_its_checksum(tmp_path):
     source.write_bytes(b"1")
     teacher = {"name": "expert", "kind": "decomposition", "source": str(source)}
     config = parse({"sgim": {"teachers": [teacher]}})
-    resolved = programs.resolve(config, "jax", Spec.of(programs.make_env(config, "test")))
+    resolved = programs.build(config).config
     noted = resolved.sgim.teachers[0].sha256
     assert noted == hashlib.sha256(b"1").hexdigest()
     before = resolved.model_dump(mode="json")
@@ -332,7 +335,7 @@ def test_a_run_knows_its_teachers_file_by_its_checksum(tmp_path):
     assert list(differences(parse(before), resolved)) == []
     np.savez(source, format=np.int32(1))
     with pytest.raises(UserError, match=f"is not the file that the run began with; its SHA-256 was {noted}"):
-        teachers.load(source, env="point_maze", spec=Spec.of(programs.make_env(config, "test")), sha256=noted)
+        teachers.load(source, env="point_maze", spec=Spec.of(make_env(config, "test")), sha256=noted)
 
 
 @pytest.mark.parametrize("kind", ["rbg", "unsafe_rbg"])
@@ -351,7 +354,7 @@ def test_a_run_refuses_to_draw_other_numbers_than_it_did():
 
 def test_a_name_with_an_underscore_in_front_is_in_the_legend():
     _, axis = pyplot.subplots()
-    axis.plot([0], label=report.literal("_baseline"))
+    axis.plot([0], label=literal("_baseline"))
     assert [text.get_text().strip() for text in axis.legend().get_texts()] == ["_baseline"]
 
 
@@ -387,7 +390,7 @@ def test_a_sweep_keeps_its_database_in_a_folder_of_any_name(name, tmp_path):
 
 
 def test_what_is_imported_leaves_the_loggers_of_the_user_alone():
-    words = "import logging, star.trainer, star.checkpoint, envs.gym; assert logging.root.handlers == []"
+    words = "import logging, star.training.trainer, envs.gym; assert logging.root.handlers == []"
     subprocess.run([sys.executable, "-c", words], env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
 
 

@@ -7,10 +7,10 @@ from pydantic import ValidationError
 
 from envs.common.errors import UserError
 from star.agent.sections import Config
+from star.config.loading import fields, load, parse
 from star.config.section import Section
-from star.loading import fields, load, parse
 
-DEFAULTS = {key: default for key, default, _ in fields()}
+DEFAULTS = {key: default for key, default, _ in fields(Config)}
 
 
 @pytest.fixture
@@ -325,7 +325,7 @@ def test_yaml_holds_every_setting():
 
 def test_fields_lists_every_setting_with_its_default_and_meaning():
     config = Config()
-    for key, default, description in fields():
+    for key, default, description in fields(Config):
         value = lookup(config, key)
         assert (value.model_dump() if isinstance(value, Section) else value) == default
         assert description
@@ -351,16 +351,16 @@ def test_the_leaves_are_exactly_the_floats():
 
 
 def test_the_agent_holds_neither_task_nor_trainer():
-    agent = Config().agent()
-    assert set(type(agent).model_fields) == set(Config.model_fields) - {"env", "trainer"}
+    agent = Config().hyper()
+    assert set(type(agent).model_fields) == set(Config.model_fields) - {"env", "experiment", "trainer"}
     assert agent.tutor == Config().tutor
 
 
 def test_floats_are_values_and_the_rest_is_structure():
-    plain = jax.tree.structure(Config().agent())
-    assert jax.tree.structure(parse({}, {"commander.learning_rate": 0.5}).agent()) == plain
+    plain = jax.tree.structure(Config().hyper())
+    assert jax.tree.structure(parse({}, {"commander.learning_rate": 0.5}).hyper()) == plain
     for change in ({"tutor.period": 5}, {"tutor.ppo.hidden": [8]}, {"refinement.enabled": False}):
-        changed = parse({}, change).agent()
+        changed = parse({}, change).hyper()
         assert jax.tree.structure(changed) != plain
         assert hash(jax.tree.structure(changed)) is not None
 
@@ -372,7 +372,7 @@ def test_flattening_and_back_is_the_identity():
 
 
 def test_several_values_of_a_float_run_under_one_vmap():
-    agents = [parse({}, {"commander.learning_rate": rate}).agent() for rate in (0.1, 0.2)]
+    agents = [parse({}, {"commander.learning_rate": rate}).hyper() for rate in (0.1, 0.2)]
     stacked = jax.tree.map(lambda *leaves: jnp.array(leaves), *agents)
     doubled = jax.vmap(lambda agent: 2 * agent.commander.learning_rate + agent.tutor.period)(stacked)
     assert doubled.tolist() == pytest.approx([10.2, 10.4])

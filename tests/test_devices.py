@@ -10,7 +10,7 @@ import pytest
 
 from envs.common.errors import UserError
 from star import cli, devices
-from star.loading import parse
+from star.config.loading import parse
 from tests.small import RUN
 
 ROOT = Path(__file__).parents[1]
@@ -72,9 +72,9 @@ import jax, jax.numpy as jnp, mujoco, numpy as np
 from envs import VectorEnv, make
 from envs.physics import Physics
 from star import devices
-from star.checkpoint import Checkpoints
+from star.training.checkpoint import Checkpoints
 from star.agent.sections import Config
-from star.metrics import Journal
+from star.training.journal import Journal
 
 address, number, folder = sys.argv[1], int(sys.argv[2]), Path(sys.argv[3])
 devices.join(f"{address},{number},2")
@@ -93,10 +93,10 @@ def walk(key):
     return {"far": devices.whole(state.obs), "fallen": jax.vmap(fall)(jnp.ones((4, 1)))}
 
 state = jax.jit(devices.on(mesh, walk), out_shardings=devices.everywhere(mesh))(jax.random.key(3))
-Journal.of(folder, muted=not devices.first()).metrics.write({"process": number})
+Journal.of(folder, tables="regions", muted=not devices.first()).metrics.write({"process": number})
 assert devices.anywhere(number == 1) and not devices.anywhere(False)
 checkpoints = Checkpoints(folder)
-checkpoints.save(1, state, Config(), success=0.0)
+checkpoints.save(1, state, Config(), score=0.0)
 checkpoints.close()
 devices.wait("the end")
 assert (folder / "metrics.jsonl").read_text() == '{"process": 0}\\n'
@@ -128,7 +128,7 @@ def test_two_processes_step_one_batch_and_the_first_alone_writes(tmp_path):
     import numpy as np
 
     from envs import VectorEnv, make
-    from star.checkpoint import Checkpoints
+    from star.training.checkpoint import Checkpoints
 
     with socket.socket() as free:
         free.bind(("localhost", 0))

@@ -5,7 +5,9 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
-from star.display import Display, Stopwatch, clock, memory, sparkline
+from star.agent.experiment import Star
+from star.agent.kind import STAR
+from star.training.console import Display, Stopwatch, clock, memory, sparkline
 
 ROW = {
     "env_steps_per_s": 45_210,
@@ -24,6 +26,7 @@ ROW = {
     "forward_model/loss": 0.0625,
 }
 SGIM = {"sgim/share_autonomous": 0.75, "sgim/share_guide": 0.25}
+WHAT = {"experiment": Star.__new__(Star), "kind": STAR}  # which shows no more than rows tell
 FAULTY = {"env/non_finite": 2.0, "env/overflow": 3.0}
 
 
@@ -59,7 +62,7 @@ def written(console):
 
 def last_view(console, *rows, stopwatch=None, done=0, left_s=75.0):
     """What stays on the terminal after an update with these rows."""
-    display = Display(console, stopwatch or Stopwatch(), title="point_maze", total_env_steps=100, done_env_steps=done)
+    display = Display(console, stopwatch or Stopwatch(), title="point_maze", **WHAT, total=100, done=done)
     with display:
         if rows:
             display.update(50, rows, left_s=left_s)
@@ -68,7 +71,7 @@ def last_view(console, *rows, stopwatch=None, done=0, left_s=75.0):
 
 def plain(*rows, quiet=False, left_s=5.0):
     console = Console(file=io.StringIO(), force_terminal=False, width=200)
-    with Display(console, Stopwatch(), total_env_steps=100, done_env_steps=0, quiet=quiet) as display:
+    with Display(console, Stopwatch(), **WHAT, total=100, done=0, quiet=quiet) as display:
         display.update(50, rows, left_s=left_s)
     return console.file.getvalue()
 
@@ -111,8 +114,8 @@ def test_a_part_that_ends_in_an_error_leaves_the_stopwatch_as_it_was(now, stopwa
 def test_the_view_shows_what_a_run_is_doing():
     view = last_view(terminal(), ROW | SGIM | FAULTY)
     for text in (
-        "training", "50%", "1:15 left", "50 of 100, 45,210/s", "any 0.75 ▇", "final 0.50 ▅", "14, 3 edges",
-        "autonomous 0.75  guide 0.25", "5 of the simulator", "GiB", "-0.02", "0.125", "0.0625",
+        "training", "50%", "1:15 left", "50 of 100, 45,210/s", "0.75 ▇", "0.50 ▅", "success any", "14, 3 edges",
+        "autonomous 0.75  guide 0.25", "simulator faults  5", "GiB", "-0.02", "0.125", "0.0625",
     ):  # fmt: skip
         assert text in view
 
@@ -135,7 +138,7 @@ def test_no_line_is_wider_than_the_terminal(width):
 
 def test_a_terminal_that_is_interrupted_gets_its_cursor_back():
     console = terminal()
-    with pytest.raises(KeyboardInterrupt), Display(console, Stopwatch(), total_env_steps=9, done_env_steps=0):
+    with pytest.raises(KeyboardInterrupt), Display(console, Stopwatch(), **WHAT, total=9, done=0):
         raise KeyboardInterrupt
     hidden, shown = (console.file.getvalue().rindex(f"\x1b[?25{end}") for end in "lh")
     assert hidden < shown
@@ -143,20 +146,21 @@ def test_a_terminal_that_is_interrupted_gets_its_cursor_back():
 
 def test_an_interrupted_run_says_that_it_stops():
     console = terminal()
-    with Display(console, Stopwatch(), total_env_steps=9, done_env_steps=0) as display:
+    with Display(console, Stopwatch(), **WHAT, total=9, done=0) as display:
         display.stop()
     assert "stopping" in written(console) and "after this epoch" in written(console)
 
 
 def test_without_a_terminal_there_is_one_plain_line_for_each_evaluation():
-    assert plain(ROW) == "50 / 100 env steps  45,210 env steps/s  regions 14  success 0.50  5 s left\n"
+    facts = "success_final 0.50  success_any 0.75  regions 14, 3 edges"
+    assert plain(ROW) == f"50 / 100 env steps  45,210 env steps/s  {facts}  5 s left\n"
     assert plain({"env_steps_per_s": 1}) == ""
     assert "left" not in plain(ROW, left_s=None)
 
 
 def test_quiet_is_quiet_but_warnings_are_shown():
     console = terminal()
-    with Display(console, Stopwatch(), total_env_steps=9, done_env_steps=0, quiet=True) as display:
+    with Display(console, Stopwatch(), **WHAT, total=9, done=0, quiet=True) as display:
         display.update(5, [ROW], left_s=None)
         assert console.file.getvalue() == ""
         display.warn("disk [/full]")

@@ -14,16 +14,19 @@ import pytest
 import envs
 from envs import opengl
 from envs.tasks import TASKS
-from star import assessment, cli, record, rendering, sweep, tables, trainer
-from star import program as programs
+from star.agent import commands as star_commands
+from star.agent import demonstrations, exam_results, exam_tables, exams, films
 from star.agent.sections import Config
 from star.cli import main
-from star.loading import fields, load, parse
+from star.config.loading import fields, load, parse
+from star.sweeps import work
+from star.training import program as programs
+from star.training import trainer
 
 ROOT = Path(__file__).parents[1]
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("docs/*.md"))}
 PAGES["README.md"] = (ROOT / "README.md").read_text(encoding="utf-8")
-DEFAULTS = {key: default for key, default, _ in fields()}
+DEFAULTS = {key: default for key, default, _ in fields(Config)}
 WRITTEN_BY_THE_TRAINER = {"seed", "env_steps", "wall_s", "env_steps_per_s"} | {
     f"eval/{name}" for name in ("success_any", "success_final", "distance", "return", "flipped")
 }
@@ -68,22 +71,22 @@ def folder(tmp_path, monkeypatch):
     """A working directory with the shipped config files and those of the tutorial, where no command really trains."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
-    for name, text in (files("docs/tutorial.md") | files("docs/howto.md")).items():
+    for name, text in (files("docs/tutorial.md") | files("docs/howto.md") | files("docs/experiments.md")).items():
         (tmp_path / name).write_text(text)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setenv("STAR_IMPORT", "")
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
     monkeypatch.setattr("star.debugging.turn_on", lambda: None)
     monkeypatch.setattr("star.devices.join", lambda cluster: None)
-    monkeypatch.setattr(assessment, "evaluate", lambda targets, exam, **_: [])
-    monkeypatch.setattr(assessment, "check_groups", lambda groups, configs: None)
-    monkeypatch.setattr(assessment, "compare", lambda rows, groups: None)
-    monkeypatch.setattr(tables, "show", lambda rows, comparison, **_: None)
-    monkeypatch.setattr(cli, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg
-    monkeypatch.setattr(rendering, "render", lambda config, show, **_: "")
-    monkeypatch.setattr("star.page.write", lambda runs, out, **_: "")
-    monkeypatch.setattr(sweep, "run", lambda found, out, **_: sweep.Summary([], True, {"trial": 0}))
-    monkeypatch.setattr(record, "record", lambda config, run_dir, out, **_: "")
+    monkeypatch.setattr(exams, "evaluate", lambda targets, exam, **_: [])
+    monkeypatch.setattr(exam_results, "check_groups", lambda groups, configs: None)
+    monkeypatch.setattr(exam_results, "compare", lambda rows, groups: None)
+    monkeypatch.setattr(exam_tables, "show", lambda rows, comparison, **_: None)
+    monkeypatch.setattr(star_commands, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg
+    monkeypatch.setattr(films, "render", lambda config, show, **_: "")
+    monkeypatch.setattr("star.report.page.write", lambda runs, out, **_: "")
+    monkeypatch.setattr(work, "run", lambda found, out, **_: work.Summary([], True, {"trial": 0}))
+    monkeypatch.setattr(demonstrations, "record", lambda config, run_dir, out, **_: "")
     return tmp_path
 
 

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from envs.common.errors import UserError
-from star.lock import locked
+from star.training.lock import locked
 
 
 def unexpected(line):

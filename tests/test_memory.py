@@ -1,14 +1,14 @@
 import pytest
 
 from envs.common.errors import UserError
-from star import memory, trainer
-from star import program as programs
-from star.loading import parse
+from star.config.loading import parse
+from star.training import memory_budget, trainer
+from star.training import program as programs
 from tests.small import RUN
 
 
 def needed(**overrides):
-    return memory.needed(programs.build(parse(RUN, {key.replace("__", "."): x for key, x in overrides.items()})))
+    return memory_budget.needed(programs.build(parse(RUN, {key.replace("__", "."): x for key, x in overrides.items()})))
 
 
 def test_twice_the_seeds_need_twice_the_memory():

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from envs.common.errors import UserError
-from star import history, page, report
+from star.agent.growth_map import growth_map
+from star.agent.kind import STAR
 from star.cli import main
-from star.loading import load, parse
+from star.config.loading import load, parse
+from star.report import history, page
 
 CUTS = [0.0, 8.0, 12.0, 16.0]
 
@@ -69,13 +71,17 @@ def make(tmp_path):
     return write
 
 
+def grown(run, most=page.MAX_BOXES):
+    return growth_map(run.config, run.tables, run.seeds, most=most)
+
+
 def read(folder):
     return history.read(folder, load(folder / "config.yaml"), name=folder.name)
 
 
 def test_a_curve_is_the_mean_over_seeds_between_the_two_where_there_are_two(make):
     run = read(make(rows=metrics(4, (0, 1), success=lambda seed, epoch: (0.2, 0.6)[seed] + epoch / 100)))
-    found = page.evaluation_curves(run.evaluations, episodes=100)
+    found = page.evaluation_curves(run.evaluations, STAR.measures, run.config)
     assert (found["env_steps"], found["wall_s"]) == ([200, 400], [4, 8])
     success = found["eval/success_final"]
     assert success == {
@@ -85,14 +91,14 @@ def test_a_curve_is_the_mean_over_seeds_between_the_two_where_there_are_two(make
         "seeds": [[0.22, 0.24], [0.62, 0.64]],
     }
     assert page.epoch_curves(run.epochs)["controller/actor_loss"] == [1.5, 2.5, 3.5, 4.5]
-    assert page.facts(run)["success_final"] == [0.44, 0.0, 1.0]
+    assert page.facts(run)["measured"]["eval/success_final"] == [0.44, 0.0, 1.0]
 
 
 def test_the_interval_narrows_with_the_number_of_seeds(make):
     widths = []
     for count in (16, 64):
         rows = metrics(2, range(count), success=lambda seed, epoch: seed % 2)
-        success = page.facts(read(make(f"run{count}", seeds=range(count), rows=rows)))["success_final"]
+        success = page.facts(read(make(f"run{count}", seeds=range(count), rows=rows)))["measured"]["eval/success_final"]
         widths.append(success[2] - success[1])
     assert widths == pytest.approx([2 * 1.96 * 0.5 / 4, 2 * 1.96 * 0.5 / 8], rel=0.15)
 
@@ -121,32 +127,32 @@ def test_of_a_run_that_goes_on_only_what_is_complete_is_shown(make):
 
 def test_regions_that_only_some_seeds_have_written_yet_are_left_out(make):
     rows = [{"seed": seed, "env_steps": n} | strip(1) for n, seed in ((200, 0), (200, 1), (400, 0))]
-    assert [row["env_steps"] for row in read(make("a", regions=rows)).regions] == [200, 200]
+    assert [row["env_steps"] for row in read(make("a", regions=rows)).tables] == [200, 200]
     assert page.content([read(make("b", regions=rows[:1]))])["runs"][0]["map"] is None
 
 
 def test_before_the_first_evaluation_there_is_a_report_without_success(make):
     shown = page.content([read(make(rows=metrics(1, (0, 1)), regions=[]))])["runs"][0]
-    assert (shown["facts"]["success_final"], shown["map"]) == (None, None)
+    assert (shown["facts"]["measured"]["eval/success_final"], shown["map"]) == (None, None)
     assert shown["evaluations"]["env_steps"] == [] and shown["epochs"]["env_steps"] == [100]
 
 
 @pytest.mark.parametrize("old", [False, True])
 def test_the_regions_of_every_moment_are_those_of_the_run(make, old):
     rows = [{"seed": seed, "env_steps": 200 * n} | strip(n, old=old) for n in (1, 2) for seed in (0, 1)]
-    grown = page.growth(read(make(regions=rows)))
-    assert grown["axes"] == ["x", "y"] and grown["start"] == [0, 0] and len(grown["walls"]) > 4
+    found = grown(read(make(regions=rows)))
+    assert found["axes"] == ["x", "y"] and found["start"] == [0, 0] and len(found["walls"]) > 4
     for i, row in enumerate(rows):
-        frame = grown["frames"][row["seed"]]["moments"][i // 2]
+        frame = found["frames"][row["seed"]]["moments"][i // 2]
         corners = [[*low, *high] for low, high in zip(row["lower"], row["upper"], strict=True)]
-        assert [list(grown["boxes"][i]) for i in frame["box"]] == corners
+        assert [list(found["boxes"][i]) for i in frame["box"]] == corners
         assert sum(frame["chosen"]) == pytest.approx(100, abs=0.1)
         assert frame.get("reaches") == row.get("reaches") and ("value" in frame) == (not old)
 
 
 def test_many_moments_are_thinned_evenly_and_keep_the_first_and_the_last(make):
     rows = [{"seed": seed, "env_steps": n} | strip(4) for n in range(1, 101) for seed in (0, 1)]
-    frames = page.growth(read(make(regions=rows)), most=5 * 2 * 12)["frames"]
+    frames = grown(read(make(regions=rows)), most=5 * 2 * 12)["frames"]
     for one in frames:
         steps = [frame["env_steps"] for frame in one["moments"]]
         assert len(steps) == 12 and steps[0] == 1 and steps[-1] == 100 and set(np.diff(steps)) == {9}
@@ -166,7 +172,7 @@ def test_only_settings_that_differ_are_listed():
 
 def test_runs_of_the_same_name_are_told_apart_by_their_paths(make):
     paths = [make("a/run"), make("b/run"), make("c")]
-    assert report.labels(paths) == [str(paths[0]), str(paths[1]), "c"]
+    assert history.labels(paths) == [str(paths[0]), str(paths[1]), "c"]
 
 
 OTHER = {"settings": {"commander.practice": 0.0}}
@@ -247,7 +253,7 @@ def test_together_runs_are_shown_as_far_as_all_have_come(make):
     first = make("first", seeds=[0], rows=metrics(3, [0]))
     both = history.together("both", [read(first), read(alone(make, "second", 1))])
     assert [rows[0]["env_steps"] for rows in both.epochs] == [100, 200, 300]
-    assert {row["env_steps"] for row in both.regions} == {200}
+    assert {row["env_steps"] for row in both.tables} == {200}
 
 
 def test_groups_come_before_other_runs(make, tmp_path, capsys):
@@ -405,7 +411,7 @@ def test_the_page_opens_from_disk_without_errors_or_requests_and_fits(browser, t
     assert (browser.problems, browser.requests) == ([], [two.absolute().as_uri()])
     assert browser.run("document.documentElement.scrollWidth <= innerWidth")
     assert browser.run("[...document.querySelectorAll('section')].map(section => section.id)") == [
-        "success", "abstraction", "strategies", "throughput", "levels", "films", "settings", "provenance",
+        "evaluations", "abstraction", "strategies", "throughput", "levels", "films", "settings", "provenance",
     ]  # fmt: skip
     background = browser.run("getComputedStyle(document.body).backgroundColor")
     assert (sum(map(int, re.findall(r"\d+", background)[:3])) < 384) == dark
@@ -446,9 +452,9 @@ def test_edges_can_be_shown_and_a_region_tells_its_values(browser, two):
 
 def test_success_can_be_seen_over_the_wall_clock(browser, two):
     browser.open(two)
-    assert "env steps" in text(browser, "#success svg") and "wall-clock" not in text(browser, "#success svg")
-    browser.run("document.querySelector('#success input[value=wall_s]').click()")
-    assert "wall-clock, s" in text(browser, "#success svg") and count(browser, "#success .band") == 2
+    assert "env steps" in text(browser, "#evaluations svg") and "wall-clock" not in text(browser, "#evaluations svg")
+    browser.run("document.querySelector('#evaluations input[value=wall_s]').click()")
+    assert "wall-clock, s" in text(browser, "#evaluations svg") and count(browser, "#evaluations .band") == 2
 
 
 def test_the_table_of_provenance_says_what_was_changed_on_resume(browser, make, tmp_path):

@@ -2,7 +2,7 @@ import jax
 import pytest
 
 from envs.common.errors import UserError
-from star.profiling import Profile, plan
+from star.training.profiling import Profile, plan
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from envs.point import PointState
-from star import cli, record
-from star import program as programs
-from star.loading import load
-from star.record import Moments
+from star import cli
+from star.agent import demonstrations
+from star.agent.demonstrations import Moments
+from star.agent.experiment import make_env
+from star.config.loading import load
 from star.sgim import teachers
 from star.spec import Spec
 
@@ -24,8 +25,8 @@ def recorded(run, tmp_path_factory):
     """What is said of the second agent's episodes, the demonstrations in the file, and the training environment."""
     out = tmp_path_factory.mktemp("recorded") / "demos.npz"
     config = load(run / "config.yaml")
-    said = record.record(config, run, out, episodes=EPISODES, agent=6, seed=1, quiet=True)
-    env = programs.make_env(config, "train")
+    said = demonstrations.record(config, run, out, episodes=EPISODES, agent=6, seed=1, quiet=True)
+    env = make_env(config, "train")
     return said, jax.tree.map(np.asarray, teachers.load(out, env="point_maze", spec=Spec.of(env))), env
 
 
@@ -72,11 +73,11 @@ def moments(success):
 def test_an_episode_is_shown_up_to_its_first_success_and_only_if_there_was_something_to_do(recorded):
     spec = Spec.of(recorded[2])
     seen = moments([[0, 0, 0], [0, 1, 0], [1, 1, 1], [0, 0, 1]])
-    demos = record.demonstrations(seen, spec, period=1)
+    demos = demonstrations.demonstrations(seen, spec, period=1)
     assert demos.lengths.tolist() == [1, 2]
     np.testing.assert_array_equal(demos.outcomes, [seen.obs[1, 1, :2], seen.obs[2, 3, :2]])
     assert demos.actions[..., 0].tolist() == [[1, 0, 0], [1, 1, 0]], "as strong as actions can be, none at the end"
-    assert record.demonstrations(moments([[0, 0, 0], [1, 1, 1]]), spec, period=1) is None
+    assert demonstrations.demonstrations(moments([[0, 0, 0], [1, 1, 1]]), spec, period=1) is None
 
 
 @pytest.fixture
@@ -89,7 +90,7 @@ def played(monkeypatch, recorded):
             asked.append((config.env.name, run_dir, how))
             return seen, Spec.of(recorded[2])
 
-        monkeypatch.setattr(record, "play", play)
+        monkeypatch.setattr(demonstrations, "play", play)
         return asked
 
     return prepare

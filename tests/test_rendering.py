@@ -15,10 +15,11 @@ from PIL import Image
 import envs
 from envs import EnvError, opengl
 from envs.common.errors import UserError
-from star import assessment, cli, rendering
-from star.assessment import Exam, Target
-from star.loading import load, parse
-from star.rendering import Moments, Show
+from star import cli
+from star.agent import exams, films
+from star.agent.exams import Exam, Target
+from star.agent.films import Moments, Show
+from star.config.loading import load, parse
 
 ROOT = Path(__file__).parents[1]
 EPISODE = 40
@@ -28,14 +29,14 @@ EPISODE = 40
 def recorded(run):
     """Three environments of the second agent, and what is said of the same episodes in an evaluation."""
     config, exam = load(run / "config.yaml"), Exam(seed=1)
-    recording = rendering.record_run(config, run, checkpoint="last", agent=6, envs=3, steps=None, exam=exam)
-    (row,) = assessment.evaluate([Target(run, "last", config)], exam)
+    recording = films.record_run(config, run, checkpoint="last", agent=6, envs=3, steps=None, exam=exam)
+    (row,) = exams.evaluate([Target(run, "last", config)], exam)
     return SimpleNamespace(recording=recording, row=row["seeds"][1])
 
 
 def random_actions(*, seed):
     config = parse({"env": {"name": "point_maze"}})
-    return rendering.record_random(config, envs=6, steps=4, seed=seed)
+    return films.record_random(config, envs=6, steps=4, seed=seed)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +48,7 @@ def wander():
 def first(recording, count):
     """Only the first `count` environments."""
     kept = {name: leaf[:, :count] for name, leaf in vars(recording.moments).items() if leaf is not None}
-    return rendering.Recording(recording.env, Moments(**kept), recording.regions)
+    return films.Recording(recording.env, Moments(**kept), recording.regions)
 
 
 def test_the_recorded_episodes_are_those_that_are_evaluated(recorded):
@@ -98,7 +99,7 @@ def test_after_its_end_an_environment_stays_as_it_was():
     leaves = {name: qpos for name in ("mocap_pos", "obs", "distance", "success")}
     whole = Moments(qpos=qpos, done=done, **leaves)
     parts = [Moments(**{k: v[i] for k, v in vars(whole).items() if v is not None}) for i in (slice(5), 5)]
-    joined = rendering._joined(*parts)
+    joined = films._joined(*parts)
     np.testing.assert_array_equal(joined.qpos[:, 0, 0], [0, 2, 4, 4, 4, 4])
     np.testing.assert_array_equal(joined.qpos[:, 1, 0], [1, 3, 5, 5, 5, 5])
 
@@ -114,13 +115,13 @@ def test_after_its_end_an_environment_stays_as_it_was():
     ],
 )
 def test_a_still_shows_the_end_and_a_film_every_nth_moment_and_the_end(out, every, total, shown):
-    assert rendering.moments_shown(total, Show(out=Path(out), every=every)) == shown
+    assert films.moments_shown(total, Show(out=Path(out), every=every)) == shown
 
 
 @pytest.mark.parametrize(("count", "across", "down"), [(1, 1, 1), (2, 1, 2), (4, 2, 2), (6, 3, 2)])
 def test_environments_stand_side_by_side(can_draw, wander, count, across, down):
     show = Show(out=Path("a.gif"), height=60)
-    one, many = (next(rendering.draw(first(wander, n), show, [4])) for n in (1, count))
+    one, many = (next(films.draw(first(wander, n), show, [4])) for n in (1, count))
     assert many.shape == (down * one.shape[0], across * one.shape[1], 3)
     if count == 2:
         above, below = np.split(many, 2)
@@ -130,10 +131,10 @@ def test_environments_stand_side_by_side(can_draw, wander, count, across, down):
 def test_a_film_of_an_agent_shows_that_it_moves_and_where_it_is_going(can_draw, run, recorded):
     recording = recorded.recording
     show = Show(out=Path("a.gif"), height=100)
-    start, end = rendering.draw(recording, show, [0, EPISODE])
+    start, end = films.draw(recording, show, [0, EPISODE])
     assert (start != end).any()
-    without = rendering.Recording(recording.env, recording.moments.replace(subgoal=None, lower=None, upper=None))
-    assert (next(rendering.draw(without, show, [EPISODE])) != end).any()
+    without = films.Recording(recording.env, recording.moments.replace(subgoal=None, lower=None, upper=None))
+    assert (next(films.draw(without, show, [EPISODE])) != end).any()
 
 
 def test_the_command_draws_a_task_and_the_same_picture_again(can_draw, tmp_path, capsys):
@@ -157,7 +158,7 @@ def test_the_command_draws_an_agent(can_draw, run, recorded, tmp_path, monkeypat
         asked.append((config.env.name, run_dir, how))
         return first(recorded.recording, how["envs"])
 
-    monkeypatch.setattr(rendering, "record_run", record)
+    monkeypatch.setattr(films, "record_run", record)
     out = tmp_path / "agent.gif"
     arguments = f"render --run {run} --out {out} --seed 6 --checkpoint 160 --evaluation-seed 9 --envs 2 --every 10"
     assert cli.main([*arguments.split(), "--height", "60"]) == 0
@@ -198,14 +199,14 @@ def test_without_opengl_the_command_says_so_before_anything_is_recorded(tmp_path
         raise EnvError("pictures need OpenGL")
 
     monkeypatch.setattr(opengl, "backend", nothing_works)
-    monkeypatch.setattr(rendering, "record_random", None)
+    monkeypatch.setattr(films, "record_random", None)
     assert cli.main(["render", "point_maze", "--out", str(tmp_path / "a.png")]) == 2
     assert capsys.readouterr().err == "error: pictures need OpenGL\n"
 
 
 def test_a_broken_driver_does_not_end_in_a_traceback(tmp_path):
     environment = os.environ | {"MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "egl", "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "star.cli", "render", "point_maze", "--out", str(tmp_path / "a.png")]
+    command = [sys.executable, "-m", "star", "render", "point_maze", "--out", str(tmp_path / "a.png")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: pictures need OpenGL") and done.stderr.count("\n") == 1
@@ -213,12 +214,12 @@ def test_a_broken_driver_does_not_end_in_a_traceback(tmp_path):
 
 def test_an_error_while_recording_becomes_one_of_the_configuration(tmp_path):
     with pytest.raises(UserError, match="unknown"):
-        rendering.render(parse({"env": {"name": "nowhere"}}), Show(out=tmp_path / "a.png"), quiet=True)
+        films.render(parse({"env": {"name": "nowhere"}}), Show(out=tmp_path / "a.png"), quiet=True)
 
 
 def test_the_gallery_shows_every_task_and_is_small():
     page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     images = ROOT / "docs" / "images"
     for name in envs.names():
-        assert f"](images/{name}.jpg)" in page and (images / f"{name}.jpg").is_file(), "run scripts/make_gallery.py"
+        assert f"](images/{name}.jpg)" in page and (images / f"{name}.jpg").is_file(), "run scripts/pages/gallery.py"
     assert sum(path.stat().st_size for path in images.iterdir()) < 1.5e6

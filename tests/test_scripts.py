@@ -15,22 +15,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.arena import Arena
-from star import loading
-from star import program as programs
 from star.abstraction import reachability
 from star.abstraction.forward_model import Outcome
 from star.abstraction.reachability import MISSES, REACHES
 from star.agent import levels
 from star.agent.decisions import Decision
-from star.checkpoint import Checkpoints, Damaged
+from star.config import loading
 from star.learners import replay
-from star.metrics import JsonLines
 from star.spec import Spec
+from star.training import program as programs
+from star.training.checkpoint import Checkpoints, Damaged
+from star.training.journal import JsonLines
 from tests.scripts import load
 
 
 def test_the_check_of_the_physics_passes_and_notices_another_model(monkeypatch):
-    script = load("verify_physics")
+    script = load("checks/physics")
     options = argparse.Namespace(
         engine="native",
         preset="fast",
@@ -52,14 +52,14 @@ def test_the_check_of_the_physics_passes_and_notices_another_model(monkeypatch):
 
 
 def test_the_benchmark_measures_both_loops():
-    script = load("benchmark_physics")
+    script = load("benchmarks/physics")
     options = argparse.Namespace(preset="fast", steps=3, repeats=2)
     row = script.measure("ant_maze", "native", 4, options)
     assert row["bare"] > 0 and row["full"] > 0 and len(row["ratios"]) == 2
 
 
 def test_the_benchmark_of_an_epoch_calls_its_parts_as_they_are(run, monkeypatch):
-    script = load("benchmark_epoch")
+    script = load("benchmarks/epoch")
     build, timed = programs.build, []
 
     def seconds(function, *arguments):
@@ -96,7 +96,7 @@ def report(name, finals, *, to_level):
 
 
 def test_the_table_tells_means_over_seeds_with_intervals_and_who_never_got_there():
-    script = load("reproduce")
+    script = load("results/reproduce")
     text = script.table(
         [
             report("star", [0.0, 1.0, 1.0, 1.0, 1.0], to_level=[3e6, 1e6, 2e6, 9e6, None]),
@@ -113,7 +113,7 @@ def test_the_table_tells_means_over_seeds_with_intervals_and_who_never_got_there
 
 
 def test_agents_and_ablations_are_found_and_others_refused():
-    script = load("reproduce")
+    script = load("results/reproduce")
     assert script.layer("star") == []
     assert script.layer("hiro") == ["--with", "configs/agents/hiro.yaml"]
     assert script.layer("grid") == ["--with", "configs/ablations/grid.yaml"]
@@ -123,7 +123,7 @@ def test_agents_and_ablations_are_found_and_others_refused():
 
 def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatch):
     """A stand-in for `star` writes metrics and reports the seeds that its run was trained with."""
-    script, trained = load("reproduce"), []
+    script, trained = load("results/reproduce"), []
 
     def run(command, **kwargs):
         _, _, _, verb, *rest = command
@@ -169,7 +169,7 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
 
 
 def test_seeds_that_follow_one_another_share_a_program():
-    groups = load("reproduce").groups
+    groups = load("results/reproduce").groups
     assert groups([0, 1, 4, 5, 7], one_by_one=False) == [[0, 1], [4, 5], [7]]
     assert groups([0, 1, 4], one_by_one=True) == [[0], [1], [4]]
     assert groups([], one_by_one=False) == []
@@ -182,7 +182,7 @@ def test_curves_are_drawn(tmp_path):
         for seed in (0, 1)
         for step in (100, 200)
     ]
-    script = load("reproduce")
+    script = load("results/reproduce")
     script.draw(points, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 1000
     for number, point in enumerate(points):
@@ -195,9 +195,9 @@ def test_curves_are_drawn(tmp_path):
 
 
 def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
-    script = load("verify_abstraction")
+    script = load("checks/abstraction")
     spec = Spec.of(breaking_env.env)
-    agent = loading.parse(tiny, {"abstraction.cuts": [[8.0], [8.0]]}).agent()
+    agent = loading.parse(tiny, {"abstraction.cuts": [[8.0], [8.0]]}).hyper()
     state = levels.init(agent, spec, key=jax.random.key(0))
     verdict = state.graph.verdict.at[0, 1].set(REACHES).at[1, 0].set(MISSES)
     state = state.replace(graph=state.graph.replace(verdict=verdict))
@@ -219,7 +219,7 @@ def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
 
 
 def test_the_fair_table_takes_one_setting_of_each_selector_for_all_beds():
-    script = load("benchmark_selection")
+    script = load("benchmarks/selection")
     rest = {"t90": [1, 1], "hopeless": 0.0, "idle": 0.0}
     found = [
         {"bed": bed, "selector": name, "constants": constants, "auc": [auc, auc + 0.02]} | rest
@@ -240,7 +240,7 @@ def test_the_fair_table_takes_one_setting_of_each_selector_for_all_beds():
 @settings(max_examples=5)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_no_random_triple_of_the_check_of_soundness_lies_outside_of_its_hull(seed):
-    script = load("verify_soundness")
+    script = load("checks/soundness")
     script.NETWORKS, script.MODELS = script.NETWORKS[:1], script.MODELS[:1]
     row = script.check_triples(10_000, seed=seed, chunk=5000)
     assert row["triples"] >= 10_000 and row["outside"] == 0 and row["nearest_ulp"] > 0
@@ -248,10 +248,10 @@ def test_no_random_triple_of_the_check_of_soundness_lies_outside_of_its_hull(see
 
 def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_small(tiny, breaking_env, monkeypatch):
     """The forward model moves everything one region to the right, and by some noise."""
-    script, spec = load("verify_soundness"), Spec.of(breaking_env.env)
+    script, spec = load("checks/soundness"), Spec.of(breaking_env.env)
     agent = loading.parse(
         tiny, {"abstraction.cuts": [[8.0], [8.0]], "refinement.parts": 8, "refinement.depth": 3}
-    ).agent()
+    ).hyper()
     state = levels.init(agent, spec, key=jax.random.key(0))
     layer = state.forward_model.params["params"]["Dense_1"]
     moving = {"kernel": 0.1 * layer["kernel"], "bias": jax.numpy.array([1.0, 0.0])}
@@ -276,7 +276,7 @@ def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_
 
 
 def test_the_benchmark_of_devices_measures_physics_and_compares_with_one_device(run):
-    script = load("benchmark_devices")
+    script = load("benchmarks/devices")
     seconds = script.physics(programs.build(loading.load(run / "config.yaml")), 2)
     assert len(seconds) == 2 and min(seconds) > 0
     one = {"devices": 1, "physics": 100.0, "acting": 50.0, "epoch": 20.0}
@@ -286,7 +286,7 @@ def test_the_benchmark_of_devices_measures_physics_and_compares_with_one_device(
 
 
 def test_the_soak_test_damages_a_checkpoint_so_that_it_is_noticed_and_finds_what_differs(run, tmp_path):
-    script, chance = load("soak"), random.Random(0)
+    script, chance = load("checks/soak"), random.Random(0)
     for kind in script.KINDS:
         copy = tmp_path / kind
         shutil.copytree(run, copy)
@@ -304,7 +304,7 @@ def test_the_soak_test_damages_a_checkpoint_so_that_it_is_noticed_and_finds_what
 
 
 def test_growth_of_memory_is_that_from_the_first_minute_after_settling_to_the_last():
-    growth = load("soak").growth
+    growth = load("checks/soak").growth
     samples = [{"s": s, "host_mib": 100.0 + min(s, 300) + (s > 600) * 3, "device_mib": 7.0} for s in range(0, 901, 5)]
     found = growth(samples, settle_s=300)
     assert found["host_mib"] == {"before": 400.0, "after": 403.0, "growth": 3.0}
@@ -315,7 +315,7 @@ def test_growth_of_memory_is_that_from_the_first_minute_after_settling_to_the_la
 @pytest.fixture
 def fuzz(monkeypatch):
     """The script, which builds what is accepted and trains nothing."""
-    script = load("fuzz_configs")
+    script = load("checks/fuzz")
     monkeypatch.setattr(programs, "build", script.Shared(0))
     monkeypatch.setattr(jax.config, "update", lambda *_: None)  # `trainer.device: cpu` is for a process
     return script

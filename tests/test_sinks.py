@@ -9,9 +9,9 @@ from PIL import Image
 from tensorboardX.proto.event_pb2 import Event
 
 from envs.common.errors import UserError
-from star import sinks
-from star.loading import parse
-from star.sinks import Sinks, TensorBoard, WandB, Worker
+from star.config.loading import parse
+from star.training import sinks
+from star.training.sinks import Sinks, TensorBoard, WandB, Worker
 
 
 def settings(*names, seeds=2):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from star import stopping
-from star.stopping import Overdue, interruptible
+from star.training import signals
+from star.training.signals import Overdue, interruptible
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -30,7 +30,7 @@ def test_what_is_computed_is_returned_and_its_errors_are_raised():
         assert stop.during(lambda: 7) == 7
         with pytest.raises(ZeroDivisionError):
             stop.during(lambda: 1 / 0)
-    assert stopping.leave(3) == 3
+    assert signals.leave(3) == 3
 
 
 @pytest.fixture
@@ -39,19 +39,19 @@ def endless():
     over = threading.Event()
     yield over.wait
     over.set()
-    for thread in stopping.computing():
+    for thread in signals.computing():
         thread.join()
 
 
-@pytest.mark.parametrize(("signals", "raised"), [([signal.SIGTERM], Overdue), ([signal.SIGINT] * 2, KeyboardInterrupt)])
-def test_a_long_computation_is_abandoned_and_the_process_leaves_it(monkeypatch, endless, signals, raised):
-    monkeypatch.setattr(stopping, "GRACE_S", 0.0)
+@pytest.mark.parametrize(("numbers", "raised"), [([signal.SIGTERM], Overdue), ([signal.SIGINT] * 2, KeyboardInterrupt)])
+def test_a_long_computation_is_abandoned_and_the_process_leaves_it(monkeypatch, endless, numbers, raised):
+    monkeypatch.setattr(signals, "GRACE_S", 0.0)
     left = []
     monkeypatch.setattr(os, "_exit", left.append)
     with interruptible() as stop:
 
         def compute():
-            for number in signals:
+            for number in numbers:
                 os.kill(os.getpid(), number)
                 while not stop():
                     pass
@@ -59,12 +59,12 @@ def test_a_long_computation_is_abandoned_and_the_process_leaves_it(monkeypatch, 
 
         with pytest.raises(raised):
             stop.during(compute)
-    stopping.leave(5)
+    signals.leave(5)
     assert left == [5]
 
 
 def test_ctrl_c_waits_for_what_is_computed(monkeypatch):
-    monkeypatch.setattr(stopping, "GRACE_S", 0.0)
+    monkeypatch.setattr(signals, "GRACE_S", 0.0)
     with interruptible() as stop:
         assert stop.during(lambda: signal.raise_signal(signal.SIGINT) or 7) == 7
         assert stop()
@@ -81,16 +81,16 @@ def ended(script, tmp_path):
 
 
 def test_ctrl_c_ends_a_command_that_imports_still(tmp_path):
-    script = "from star import cli; cli._run = lambda _: __import__('swallows') and 0; cli.main()"
+    script = "from star.cli import command; command._run = lambda _: __import__('swallows') and 0; command.main()"
     assert ended(script, tmp_path) == (130, "")
 
 
 def test_an_interrupted_command_ends_without_taking_python_down_under_what_computes(tmp_path):
     script = """
 import atexit, os, signal
-from star import cli
+from star.cli import command
 atexit.register(print, "Python was taken down")
-cli._run = lambda _: os.kill(os.getpid(), signal.SIGINT)
-cli.main()
+command._run = lambda _: os.kill(os.getpid(), signal.SIGINT)
+command.main()
 """
     assert ended(script, tmp_path) == (130, "")

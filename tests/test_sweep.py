@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import optuna
@@ -28,11 +29,16 @@ from optuna.distributions import FloatDistribution, IntDistribution
 from rich.console import Console
 
 from envs.common.errors import UserError
-from star import cli, sweep, sweep_report
-from star import program as programs
-from star.loading import fields, kind, load, parse
-from star.study import Cmaes, Ledger, reason
-from star.sweep import open_ledger, plan, work
+from star import cli
+from star.agent.sections import Config
+from star.config.kinds import Measure
+from star.config.loading import fields, load, parse, type_of
+from star.sweeps import results
+from star.sweeps import work as working
+from star.sweeps.ledger import Cmaes, Ledger, reason
+from star.sweeps.plan import plan
+from star.sweeps.work import open_ledger, work
+from star.training import program as programs
 from tests.small import EPOCH, RUN
 
 ROOT = Path(__file__).parents[1]
@@ -64,7 +70,7 @@ def closed(monkeypatch):
             super().__init__(*arguments, **settings)
             ledgers.append(self)
 
-    monkeypatch.setattr(sweep, "Ledger", Closing)
+    monkeypatch.setattr(working, "Ledger", Closing)
     yield
     for ledger in ledgers:
         ledger.close()
@@ -73,7 +79,7 @@ def closed(monkeypatch):
 class Stub:
     """Trains nothing: an epoch takes `wait_s`, and a trial is as good as its `controller.ppo.learning_rate` is high."""
 
-    epochs, env_steps_per_epoch = 4, EPOCH
+    epochs, steps_per_epoch = 4, EPOCH
 
     def __init__(self, config, slots, *, wait_s=0.0):
         self.slots, self.wait_s = slots, wait_s
@@ -112,11 +118,11 @@ def finished(path, make=Stub, *, out="out", **changes):
 def test_every_float_of_the_agent_may_differ_side_by_side_and_nothing_else():
     """What `structure` takes for equal is one jitted function; whatever else changes is another."""
     base = parse(RUN)
-    for key, _, _ in fields():
-        if kind(key) is float:
+    for key, _, _ in fields(Config):
+        if type_of(key, Config) is float:
             other = parse(RUN, {key: 0.5 if key != "commander.goal_margin" else 2.0})
             assert programs.structure(other) == programs.structure(base), key
-        elif kind(key) is bool:
+        elif type_of(key, Config) is bool:
             values = base.model_dump(mode="json")
             for part in key.split(".")[:-1]:
                 values = values[part]
@@ -128,7 +134,7 @@ def test_every_float_of_the_agent_may_differ_side_by_side_and_nothing_else():
 
 
 def test_a_grid_tries_every_point_once_and_writes_down_which_is_best(folder, capsys, monkeypatch):
-    monkeypatch.setattr(sweep.work, "__kwdefaults__", sweep.work.__kwdefaults__ | {"make": Stub})
+    monkeypatch.setattr(working.work, "__kwdefaults__", working.work.__kwdefaults__ | {"make": Stub})
     parameters = {"controller.ppo.learning_rate": ["1e-4", 1e-3], "tutor.ppo.hidden": [[8], [4, 4]]}
     path = written(parameters=parameters)
     assert cli.main(["sweep", str(path), "--out", "out"]) == 0
@@ -199,11 +205,10 @@ def test_names_and_values_reach_table_and_figures_as_they_were_typed(tmp_path):
         for i, text in enumerate(odd)
     ]
     console = Console(width=200, file=io.StringIO())
-    console.print(sweep_report.table(rows, parameters=["env.options.map"], objective="success"))
+    found = SimpleNamespace(distributions={"env.options.map": None}, objective="success", measure=Measure("success"))
+    console.print(results.table(rows, found))
     assert all(text in console.file.getvalue() for text in odd)
-    sweep_report.write(
-        tmp_path, rows, parameters=["env.options.map"], objective="success", shares={"env.options.map": 1.0}
-    )
+    results.write(tmp_path, rows, found, shares={"env.options.map": 1.0})
     assert (tmp_path / "figures" / "parallel.png").exists()
 
 
@@ -338,7 +343,7 @@ def test_the_study_of_another_sweep_is_refused(folder):
         open_ledger(other, "sqlite:///out/sweep.db")
     before = {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
     with pytest.raises(UserError, match="out: holds the results of the sweep three; choose another --out"):
-        sweep.run(plan(written(study="four")), Path("out"), quiet=True)
+        working.run(plan(written(study="four")), Path("out"), quiet=True)
     assert {path: path.read_bytes() for path in before} == before
 
 
@@ -346,7 +351,9 @@ WORKERS = """
 import os, pickle, signal, sys
 sys.path.insert(0, {tests!r})
 from pathlib import Path
-from star.sweep import open_ledger, work
+from types import SimpleNamespace
+from star.sweeps.plan import plan
+from star.sweeps.work import open_ledger, work
 from test_sweep import Stub
 
 def worker(found, url):

@@ -23,15 +23,18 @@ import yaml
 
 import envs
 from envs.common.errors import UserError
-from star import checkpoint, cli, provenance, report, starting, stopping, stretch, trainer
-from star import program as programs
-from star.checkpoint import Checkpoints, check_compatible
-from star.loading import load, parse
-from star.lock import locked
-from star.metrics import Journal, JsonLines
-from star.migrations import FORMAT
+from star import cli
+from star.agent import figures
+from star.agent.migrations import FORMAT
+from star.config.loading import load, parse
 from star.sgim import teachers
-from star.side_by_side import SideBySide
+from star.training import checkpoint, loop, provenance, run_folder, signals, trainer
+from star.training import program as programs
+from star.training.checkpoint import Checkpoints
+from star.training.compatibility import check_compatible
+from star.training.journal import Journal, JsonLines
+from star.training.lock import locked
+from star.training.side_by_side import SideBySide
 from tests.small import EPOCH, RUN, unpacked
 
 ROOT = Path(__file__).parents[1]
@@ -99,7 +102,7 @@ def test_metrics_have_a_line_for_each_epoch_and_seed(finished):
 
 def test_regions_have_a_line_for_each_evaluation_and_seed_and_cover_the_space(finished):
     run_dir, _ = finished
-    table, metrics = Journal.of(run_dir).regions.read(), rows(run_dir)
+    table, metrics = Journal.of(run_dir, tables="regions").tables.read(), rows(run_dir)
     assert [(row["env_steps"], row["seed"]) for row in table] == [(n * EPOCH, s) for n in (2, 4) for s in (0, 1)]
     for row in table:
         lower, upper = np.array(row["lower"]), np.array(row["upper"])
@@ -116,24 +119,26 @@ def test_regions_have_a_line_for_each_evaluation_and_seed_and_cover_the_space(fi
     ("moments", "shown"),
     [(None, [10, 20, 30, 40]), ([5, 15], [10, 20]), ([20, 25, 28, math.inf], [20, 30, 40])],
 )
-def test_the_figure_of_growth_shows_the_regions_at_the_moments_asked_for(tmp_path, monkeypatch, moments, shown):
+def test_the_figure_of_growth_shows_the_regions_at_the_moments_asked_for(monkeypatch, moments, shown):
     box = {"lower": [[0.0, 0.0]], "upper": [[1.0, 1.0]], "chosen": [1.0]}
     regions = [{"seed": seed, "env_steps": n} | box for n in (10, 20, 30, 40) for seed in (3, 4)]
     drawn = []
-    monkeypatch.setattr(report, "draw_regions", lambda axis, row, walls: drawn.append((row["seed"], row["env_steps"])))
-    report.growth_figure(tmp_path / "growth.png", regions=regions, walls=[], moments=moments)
+    monkeypatch.setattr(figures, "draw_regions", lambda axis, row, walls: drawn.append((row["seed"], row["env_steps"])))
+    figures.growth_figure(regions=regions, walls=[], moments=moments)
     assert drawn == [(3, n) for n in shown]
 
 
 def test_a_run_notes_each_time_it_begins_with_what_and_where(finished, tmp_path):
     run_dir, _ = finished
-    (start,) = Journal.of(run_dir).provenance.read()
+    (start,) = Journal.of(run_dir, tables="regions").provenance.read()
     assert (start["env_steps"], start["settings"]) == (0, {}) and start["device"].startswith("CPU, ")
     assert start["versions"]["jax"] == jax.__version__
     shutil.copytree(run_dir, tmp_path / "run")
     for changed in ({}, {"tutor__reward_scale": 3.0, "trainer__sinks": []}):
         trainer.train(tiny(**changed), tmp_path / "run", resume=True, quiet=True)
-    noted = [(row["env_steps"], row["settings"]) for row in Journal.of(tmp_path / "run").provenance.read()]
+    noted = [
+        (row["env_steps"], row["settings"]) for row in Journal.of(tmp_path / "run", tables="regions").provenance.read()
+    ]
     other = {"tutor.reward_scale": 3.0, "trainer.sinks": []}
     assert noted == [(0, {}), (4 * EPOCH, {}), (4 * EPOCH, other)]
     assert (tmp_path / "run" / "config.yaml").read_bytes() == (run_dir / "config.yaml").read_bytes()
@@ -169,7 +174,7 @@ def test_an_interrupted_run_resumes_to_the_same_final_state_bit_for_bit(finished
     result = trainer.train(load(part / "config.yaml"), part, resume=True, quiet=True)
     assert not result.interrupted
     assert rows(part) == rows(run_dir)
-    assert Journal.of(part).regions.read() == Journal.of(run_dir).regions.read()
+    assert Journal.of(part, tables="regions").tables.read() == Journal.of(run_dir, tables="regions").tables.read()
     assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
 
 
@@ -185,12 +190,12 @@ def test_an_epoch_too_long_for_sigterm_is_given_up_and_the_one_before_it_saved(f
     run_dir, _ = finished
     part, over = tmp_path / "part", threading.Event()
     with monkeypatch.context() as patch:
-        patch.setattr(stopping, "GRACE_S", 0.0)
-        patch.setattr(stretch, "_LONG_S", 0.0)
+        patch.setattr(signals, "GRACE_S", 0.0)
+        patch.setattr(loop, "_LONG_S", 0.0)
         interrupt_after(patch, epochs=4, number=signal.SIGTERM, then=over.wait)
         result = trainer.train(tiny(), part, quiet=True)
         over.set()
-        for thread in stopping.computing():
+        for thread in signals.computing():
             thread.join()
     assert result.terminated and result.env_steps == 3 * EPOCH
     assert Checkpoints(part).steps() == [2 * EPOCH, 3 * EPOCH]
@@ -211,7 +216,7 @@ def test_a_damaged_newest_checkpoint_is_set_aside_and_the_run_goes_on_from_the_o
     err = capsys.readouterr().err
     assert f"it is now {4 * EPOCH}.damaged, and the run goes on from {2 * EPOCH} env steps" in err
     assert err.count("\n") == 1
-    assert Journal.of(part).provenance.read()[-1]["env_steps"] == 2 * EPOCH
+    assert Journal.of(part, tables="regions").provenance.read()[-1]["env_steps"] == 2 * EPOCH
     assert {entry.name for entry in (part / "checkpoints").iterdir()} == {str(2 * EPOCH), str(4 * EPOCH)}
     assert_same_end(part, run_dir)
 
@@ -229,8 +234,8 @@ def test_a_run_killed_before_its_first_checkpoint_begins_anew(finished, tmp_path
     trainer.train(load(part / "config.yaml"), part, resume=True, quiet=True)
     assert capsys.readouterr().err == f"warning: {part}: holds no checkpoint, so it begins anew\n"
     assert rows(part) == rows(run_dir)
-    assert Journal.of(part).regions.read() == Journal.of(run_dir).regions.read()
-    assert len(Journal.of(part).provenance.read()) == 2
+    assert Journal.of(part, tables="regions").tables.read() == Journal.of(run_dir, tables="regions").tables.read()
+    assert len(Journal.of(part, tables="regions").provenance.read()) == 2
     assert_equal(saved_state(tiny(), part), saved_state(tiny(), run_dir))
 
 
@@ -238,10 +243,10 @@ def test_what_a_run_killed_at_once_left_does_not_keep_another_from_beginning(tmp
     for name in (".lock", ".config-abc/config.yaml"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    starting.make(tmp_path)
+    run_folder.make(tmp_path)
     (tmp_path / "config.yaml").touch()
     with pytest.raises(UserError, match="is not empty"):
-        starting.make(tmp_path)
+        run_folder.make(tmp_path)
 
 
 def test_a_second_process_is_refused_and_changes_nothing(finished):
@@ -286,7 +291,7 @@ def test_what_sgim_has_chosen_is_written_down(finished):
     for row in rows(run_dir):
         assert sum(row[f"sgim/share_{name}"] for name in ("autonomous", "babbling", "guide")) == pytest.approx(1)
         assert row["sgim/queries_guide"] <= 3
-    for row in Journal.of(run_dir).regions.read():
+    for row in Journal.of(run_dir, tables="regions").tables.read():
         assert len(row["competence"]) == len(row["drawn"]) == len(row["chosen"])
         assert sum(row["drawn"]) == pytest.approx(1, abs=1e-3)
 
@@ -336,7 +341,7 @@ def test_a_map_is_kept_whatever_becomes_of_its_file(section, tmp_path):
 def test_neither_the_length_of_training_episodes_nor_what_was_planned_before_changes_evaluation():
     shorter = {"env.training.episode_length": 20, "tutor.unroll": 1}
     one, other = (programs.build(parse(RUN, {"tutor.unroll": 1} | more)) for more in ({}, shorter))
-    assert (one.spec.episode_length, other.spec.episode_length) == (60, 20)
+    assert (one.experiment.spec.episode_length, other.experiment.spec.episode_length) == (60, 20)
     fresh, shorter_fresh = (program.init(program.seed_keys()) for program in (one, other))
     planned = jax.random.uniform(jax.random.key(0), fresh.commander.q.shape)
     before = fresh.replace(commander=fresh.commander.replace(q=planned))
@@ -360,13 +365,13 @@ def test_nothing_is_compiled_after_the_first_epoch(caplog):
 def test_evaluation_reports_intervals_for_every_seed(finished, capsys):
     run_dir, _ = finished
     assert cli.main(["evaluate", str(run_dir), "--episodes", "5", "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert [row["seed"] for row in report["seeds"]] == [0, 1]
-    assert report["episodes"] == 10 and report["env_steps"] == 4 * EPOCH
+    figures = json.loads(capsys.readouterr().out)
+    assert [row["seed"] for row in figures["seeds"]] == [0, 1]
+    assert figures["episodes"] == 10 and figures["env_steps"] == 4 * EPOCH
     for name in ("success_any", "success_final", "distance", "return"):
-        low, high = report[f"{name}_interval"]
-        assert low <= report[name] <= high
-    assert report["success_final"] <= report["success_any"]
+        low, high = figures[f"{name}_interval"]
+        assert low <= figures[name] <= high
+    assert figures["success_final"] <= figures["success_any"]
 
 
 def test_evaluation_of_a_checkpoint_that_is_not_there_names_those_that_are(finished, capsys):
@@ -399,9 +404,9 @@ def test_four_devices_train_as_one_does_and_any_number_goes_on(finished, tmp_pat
 import json, sys
 from pathlib import Path
 import jax
-from star import checkpoint, trainer
-from star import program as programs
-from star.loading import parse
+from star.config.loading import parse
+from star.training import checkpoint, trainer
+from star.training import program as programs
 
 config, run_dir = json.loads(sys.argv[1]), Path(sys.argv[2])
 trainer.train(parse(config, {"trainer.devices": 4}), run_dir, quiet=True)
@@ -419,7 +424,7 @@ assert jax.device_get(state.epoch).tolist() == [2, 2]
         assert ours.keys() == theirs.keys()
         for key, value in theirs.items():
             assert ours[key] == pytest.approx(value, rel=1e-3, abs=1e-4), key
-    started = Journal.of(run_dir).provenance.read()
+    started = Journal.of(run_dir, tables="regions").provenance.read()
     assert started[0]["device"] == f"4 x {started[1]['device']}"
 
 
@@ -427,11 +432,12 @@ def test_a_checkpoint_loads_on_a_machine_without_the_device_it_was_saved_on(tmp_
     saving = """
 import sys, jax, jax.numpy as jnp
 from pathlib import Path
-from star.checkpoint import Checkpoints, check_compatible
+from star.training.checkpoint import Checkpoints
+from star.training.compatibility import check_compatible
 from star.agent.sections import Config
 state = {"x": jax.device_put(jnp.arange(3.0), jax.devices()[1])}
 checkpoints = Checkpoints(Path(sys.argv[1]))
-checkpoints.save(7, state, Config(), success=0.0)
+checkpoints.save(7, state, Config(), score=0.0)
 checkpoints.close()
 """
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
@@ -453,7 +459,7 @@ def test_ctrl_c_writes_a_checkpoint_and_says_how_to_resume(tmp_path):
     endless = {"total_env_steps": 10**9, "eval_every": 10**6, "sinks": []}  # TensorBoard's imports PyTorch
     values = TINY | alone | {"trainer": TINY["trainer"] | endless}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
-    command = [sys.executable, "-m", "star.cli", "train", "config.yaml", "--run-dir", "run"]
+    command = [sys.executable, "-m", "star", "train", "config.yaml", "--run-dir", "run"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -476,7 +482,7 @@ def test_only_the_latest_checkpoints_and_the_best_are_kept(tmp_path):
     state = program.init(program.seed_keys())
     checkpoints = Checkpoints(tmp_path, keep=2)
     for step, success in ((1, 0.1), (2, 0.9), (3, 0.2), (4, 0.3), (5, 0.4)):
-        checkpoints.save(step, state, program.config, success=success)
+        checkpoints.save(step, state, program.config, score=success)
     assert checkpoints.steps() == [2, 4, 5]
     assert checkpoints.best() == 2
     checkpoints.close()

@@ -22,8 +22,8 @@ from typing import Any
 WORKER = """
 import json, sys, time
 import jax
-from star import program as programs
-from star.loading import load
+from star.config.loading import load
+from star.training import program as programs
 
 compiled = []
 jax.monitoring.register_event_duration_secs_listener(
@@ -42,7 +42,7 @@ first = epoch()
 compiled.clear()
 epoch()
 device = jax.devices()[0].device_kind
-print(json.dumps({"first_epoch_s": first, "device": device, "env_steps": program.env_steps_per_epoch}), flush=True)
+print(json.dumps({"first_epoch_s": first, "device": device, "env_steps": program.steps_per_epoch}), flush=True)
 for _ in sys.stdin:
     seconds = epoch()
     print(json.dumps({"s": seconds, "compiled": len(compiled)}), flush=True)
@@ -78,7 +78,7 @@ def main() -> int:
             {
                 "config": options.config.stem,
                 "device": told[0]["device"],
-                "env_steps_per_epoch": told[0]["env_steps"],
+                "steps_per_epoch": told[0]["env_steps"],
                 "median_s": dict(zip(names, middle, strict=True)),
                 "ratio": ratio,
                 "first_epoch_s": dict(zip(names, (row["first_epoch_s"] for row in told), strict=True)),

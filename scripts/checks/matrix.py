@@ -53,7 +53,7 @@ MODES: Mapping[str, tuple[Mapping[str, str], Sequence[str]]] = {
     "`JAX_PLATFORMS=abacus`": ({"JAX_PLATFORMS": "abacus"}, ()),
     "`python -O`": ({}, ("-O",)),
 }
-TRAINED = ROOT / "scripts/smallest.yaml"
+TRAINED = ROOT / "scripts/checks/smallest.yaml"
 
 
 # Objects, each used for a few steps
@@ -347,7 +347,7 @@ def travels() -> Table:
 
     import envs
     from star import sgim
-    from star.loading import load
+    from star.config.loading import load
 
     env = envs.make("point_maze", episode_length=9)
     things = {
@@ -424,7 +424,8 @@ def types() -> Table:
     """Every option of the tasks and every setting x the types in which people pass them."""
     import envs
     from envs import tasks
-    from star import loading
+    from star.agent.sections import Config
+    from star.config import loading
 
     rows = "11111\n1r001\n11111"
     valid = {
@@ -459,7 +460,7 @@ def types() -> Table:
                     continue  # the path of a file, not its text
                 make = partial(_as_made, envs, name, key)
                 check("options of tasks", key, twin, partial(make, other), partial(make, value))
-    for key, default, _ in loading.fields():
+    for key, default, _ in loading.fields(Config):
         for twin, other in twins(default):
             parse = partial(_as_parsed, loading, key)
             check("settings", key, twin, partial(parse, other), partial(parse, default))
@@ -489,7 +490,8 @@ def _as_parsed(loading: Any, key: str, value: Any) -> Any:
 def files() -> Table:
     """Files that are read x encodings and line ends."""
     import envs
-    from star import loading, sweep
+    from star.config import loading
+    from star.sweeps.plan import plan as planned
 
     config = TRAINED.read_text(encoding="utf-8") + "# \N{GREEK SMALL LETTER ALPHA}\n"
     layer = "tutor:\n  reward: distance  # \N{GREEK SMALL LETTER ALPHA}\n"
@@ -508,7 +510,7 @@ def files() -> Table:
         "sweep": (
             plan.replace("../point_maze.yaml", str(base / "point_maze.yaml")),
             ".yaml",
-            lambda path: sweep.plan(path).name,
+            lambda path: planned(path).name,
         ),
     }
     encodings = {

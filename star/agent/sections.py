@@ -1,15 +1,14 @@
-"""The settings of the three levels, and of a whole experiment with them. `star.loading` reads them from files."""
+"""The settings of the three levels, and of a whole experiment with them."""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from envs.common import reading
 from star.abstraction.sections import AbstractionConfig, ForwardModelConfig, RefinementConfig
-from star.config.run import EnvConfig, TrainerConfig
+from star.config.run import EnvConfig, RunConfig, TrainerConfig
 from star.config.section import Batch, Hidden, Positive, Repeats, Section
 from star.learners import Rollout
 from star.learners.sections import LevelConfig
@@ -140,7 +139,14 @@ class ControllerConfig(LevelConfig):
         return self
 
 
-class Config(Section):
+class StarTrainerConfig(TrainerConfig):
+    """The host loop, and the environments of its epochs and evaluations."""
+
+    num_envs: Batch = Field(128, description="environments stepped together, per seed")
+    eval_episodes: Batch = Field(100, description="episodes of each evaluation, per seed")
+
+
+class Config(RunConfig):
     """A whole experiment."""
 
     env: EnvConfig = EnvConfig()
@@ -151,7 +157,7 @@ class Config(Section):
     forward_model: ForwardModelConfig = ForwardModelConfig()
     refinement: RefinementConfig = RefinementConfig()
     sgim: SgimConfig = SgimConfig()
-    trainer: TrainerConfig = TrainerConfig()
+    trainer: StarTrainerConfig = StarTrainerConfig()
 
     @model_validator(mode="after")
     def _periods_fit(self) -> Self:
@@ -191,13 +197,13 @@ class Config(Section):
         tutor = [("tutor", self.tutor, size(self.tutor.unroll))] if self.tutor.enabled else []
         return [*tutor, ("controller", self.controller, size(self.tutor.period))]
 
-    def agent(self) -> AgentConfig:
+    def hyper(self) -> AgentConfig:
         """The sections that the jitted program sees."""
         return AgentConfig(**{name: getattr(self, name) for name in AgentConfig.model_fields})
 
-    def to_yaml(self) -> str:
-        """Every resolved value as YAML that `star.loading.load` accepts."""
-        return reading.written(self.model_dump(mode="json"))
+    def comparable(self) -> dict[str, Any]:
+        """All values but the checksums of teachers' files, which are checked where these are read."""
+        return self.model_dump(mode="json", exclude={"sgim": {"teachers": {"__all__": {"sha256"}}}})
 
 
 class AgentConfig(Section):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 from flax import struct
 from jaxtyping import Array, Int
 
@@ -29,8 +28,3 @@ class TrainState(struct.PyTreeNode):
     sgim: SgimState | None
     epoch: Int[Array, ""]
     key: Array
-
-
-def leaf_name(path: tuple[Any, ...]) -> str:
-    """That of a leaf, such as `tutor/optimizer/1/count`, the same in a `TrainState` and in what orbax reads without."""
-    return jax.tree_util.keystr(path, simple=True, separator="/")

@@ -1,6 +1,10 @@
 "use strict";
 // Draws the report from the JSON in #data. All text of the runs goes in as text nodes, never as markup.
 const { made, runs, settings } = JSON.parse(document.getElementById("data").textContent);
+// what the runs measure, each once, and what they count
+const measures = [...new Map(runs.flatMap(run => run.measures).map(one => [one.key, one])).values()];
+const unit = runs.every(run => run.unit === runs[0].unit) ? runs[0].unit : "steps";
+const where = measures[0].where ? ` ${measures[0].where}` : "";
 const page = document.getElementById("page");
 const VIRIDIS = ["440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725"];
 const SLOTS = 6; // colours; after them lines are dashed
@@ -37,6 +41,10 @@ function duration(seconds) {
   if (seconds < 60) return `${Math.round(seconds)} s`;
   const minutes = Math.round(seconds / 60);
   return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+}
+function interval([mean, low, high]) {
+  const short = value => (value === null ? "–" : String(+value.toPrecision(4)));
+  return low === null ? short(mean) : `${short(mean)} [${short(low)}, ${short(high)}]`;
 }
 function share(values) {
   const [mean, low, high] = values.map(value => value?.toFixed(2));
@@ -159,7 +167,7 @@ function clocked(table, clock) {
   return clock === "env_steps" ? table.env_steps : table.wall_s.map(seconds => seconds * unit.factor);
 }
 const clockLabel = clock =>
-  clock === "env_steps" ? "env steps" : timeUnit(Math.max(...runs.map(run => run.facts.wall_s))).label;
+  clock === "env_steps" ? unit : timeUnit(Math.max(...runs.map(run => run.facts.wall_s))).label;
 
 function choice(name, options, onchange) {
   const group = html("fieldset", { "aria-label": name });
@@ -184,6 +192,7 @@ function table(head, rows, attributes = {}) {
 
 function opening() {
   const tasks = [...new Set(runs.map(run => run.task))].join(", ");
+  const withRegions = runs.some(run => run.facts.regions !== null);
   document.title = `${runs.length === 1 ? runs[0].name : plural(runs.length, "run")} · STAR report`;
   page.append(html("header", {},
     html("h1", {}, runs.length > 3 ? plural(runs.length, "run") : runs.map(run => run.name).join(", ")),
@@ -192,39 +201,43 @@ function opening() {
     const done = facts.env_steps >= facts.total_env_steps;
     return [
       [key(slot), name],
-      facts.success_final ? share(facts.success_final) : "–",
-      facts.success_any ? share(facts.success_any) : "–",
+      ...measures.map(({ key, share: isShare }) =>
+        facts.measured[key] ? (isShare ? share : interval)(facts.measured[key]) : "–"),
       `${seeds.length}`,
       [compact(facts.env_steps), done ? null : html("small", {}, ` of ${compact(facts.total_env_steps)}`)],
       duration(facts.wall_s),
       compact(facts.env_steps_per_s),
-      facts.regions === null ? "–" : compact(facts.regions),
+      ...(withRegions ? [facts.regions === null ? "–" : compact(facts.regions)] : []),
     ];
   });
-  page.append(table(["run", "success at the last step", "success at any step", "seeds", "env steps per seed", "wall-clock",
-    "env steps/s", "regions"], rows, { class: "runs" }));
-  page.append(html("p", { class: "note" }, "Success: share of greedy episodes on test goals in the last evaluation, mean over "
-    + "seeds with the 95 % interval of that mean (Student's t). Env steps/s: of all seeds together, median of the epochs."));
+  page.append(table(["run", ...measures.map(one => one.label), "seeds", `${unit} per seed`, "wall-clock",
+    `${unit}/s`, ...(withRegions ? ["regions"] : [])], rows, { class: "runs" }));
+  page.append(html("p", { class: "note" }, `${measures.map(one => one.label).join(", ")}: in the last evaluation${where}, mean over `
+    + `seeds with the 95 % interval of that mean (Student's t). ${unit}/s: of all seeds together, median of the epochs.`));
 }
 
-function success() {
-  const chosen = { measure: "success_final", clock: "env_steps", seeds: false };
+function evaluations() {
+  const chosen = { measure: measures[0].key, clock: "env_steps", seeds: false };
   const host = html("div");
-  const drawn = chart(host, () => ({
-    series: runs.map((run, slot) => {
-      const found = run.evaluations[`eval/${chosen.measure}`] || { mean: [], low: [], high: [], seeds: [] };
-      const { mean, low, high, seeds } = found;
-      return { name: run.name, slot, x: clocked(run.evaluations, chosen.clock), y: mean, low, high,
-        seeds: chosen.seeds && seeds.length > 1 ? seeds : [] };
-    }),
-    x: clockLabel(chosen.clock), y: "share of episodes", low: 0, high: 1, height: 340, empty: "No evaluation yet.",
-  }));
+  const drawn = chart(host, () => {
+    const measure = measures.find(one => one.key === chosen.measure);
+    return {
+      series: runs.map((run, slot) => {
+        const found = run.evaluations[chosen.measure] || { mean: [], low: [], high: [], seeds: [] };
+        const { mean, low, high, seeds } = found;
+        return { name: run.name, slot, x: clocked(run.evaluations, chosen.clock), y: mean, low, high,
+          seeds: chosen.seeds && seeds.length > 1 ? seeds : [] };
+      }),
+      x: clockLabel(chosen.clock), y: measure.share ? "share of episodes" : measure.label, ...(measure.share ? { low: 0, high: 1 } : {}),
+      height: 340, empty: "No evaluation yet.",
+    };
+  });
   const set = name => value => { chosen[name] = value; drawn.redraw(); };
-  section("success", "Success on test goals",
-    "Mean over seeds of the share of greedy episodes that reach the goal; the band is the 95 % interval of that mean (Student's t).",
+  section("evaluations", `Evaluations${where}`,
+    "Mean over seeds; the band is the 95 % interval of that mean (Student's t).",
     html("div", { class: "controls" },
-      choice("measure", [["success_final", "at the last step"], ["success_any", "at any step"]], set("measure")),
-      choice("clock", [["env_steps", "env steps"], ["wall_s", "wall-clock"]], set("clock")),
+      choice("measure", measures.map(({ key, label }) => [key, label]), set("measure")),
+      choice("clock", [["env_steps", unit], ["wall_s", "wall-clock"]], set("clock")),
       html("label", {}, html("input", { type: "checkbox", id: "each", onchange: event => set("seeds")(event.target.checked) }), " each seed")),
     legend(), host);
 }
@@ -465,7 +478,7 @@ function strategies() {
         base = low.map((value, i) => value + (y[i] ?? 0));
         return { name, slot: names.indexOf(name), x: epochs.env_steps, y, low, high: base, area: true };
       });
-      return { series, x: "env steps", y: "share of episodes", low: 0, high: 1, height: 240 };
+      return { series, x: unit, y: "share of episodes", low: 0, high: 1, height: 240 };
     });
     return html("figure", {}, html("h3", {}, key(runs.indexOf(run)), run.name), host);
   });
@@ -492,8 +505,8 @@ function throughput() {
   const through = run => ({ table: run.epochs, y: run.epochs.env_steps });
   section("throughput", "Throughput", "Of all seeds of a run together, learning included; the first epoch also compiles.", legend(),
     html("div", { class: "grid" },
-      small("env steps/s", "env_steps_per_s", epochs("env_steps_per_s"), "env steps per second", { low: 0 }),
-      small("env steps per seed over wall-clock", "env_steps", through, "env steps", { clock: "wall_s", low: 0 })));
+      small(`${unit}/s`, "env_steps_per_s", epochs("env_steps_per_s"), `${unit} per second`, { low: 0 }),
+      small(`${unit} per seed over wall-clock`, "env_steps", through, unit, { clock: "wall_s", low: 0 })));
 }
 
 const LEVELS = [
@@ -553,7 +566,7 @@ function films() {
 
 function changed({ facts }) {
   const all = facts.changes.map(({ key, value, env_steps }) =>
-    `${key} ${value} from ${env_steps.toLocaleString("en")} env steps`).join("; ");
+    `${key} ${value} from ${env_steps.toLocaleString("en")} ${unit}`).join("; ");
   return all || (facts.starts.at(-1)?.settings ? "nothing" : "");
 }
 
@@ -561,11 +574,11 @@ function provenance() {
   const facts = [
     ["run", run => html("code", {}, run.facts.path)],
     ["seeds", run => run.seeds.join(", ")],
-    ["env steps per seed", run => `${run.facts.env_steps.toLocaleString("en")} of ${run.facts.total_env_steps.toLocaleString("en")}`],
+    [`${unit} per seed`, run => `${run.facts.env_steps.toLocaleString("en")} of ${run.facts.total_env_steps.toLocaleString("en")}`],
     ["wall-clock", run => duration(run.facts.wall_s)],
-    ["engine", run => run.facts.engine],
+    ...(runs.some(run => run.facts.engine) ? [["engine", run => run.facts.engine]] : []),
     ["began", run => run.facts.starts.map(({ time, env_steps }) =>
-      `${time.slice(0, 16).replace("T", " ")} UTC${env_steps ? `, from ${compact(env_steps)} env steps` : ""}`).join("; ")],
+      `${time.slice(0, 16).replace("T", " ")} UTC${env_steps ? `, from ${compact(env_steps)} ${unit}` : ""}`).join("; ")],
     ["device", run => [...new Set(run.facts.starts.map(start => start.device))].join("; ")],
     ["commit", run => [...new Set(run.facts.starts.map(start => start.commit).filter(Boolean))].join("; ")],
     ["Python", run => [...new Set(run.facts.starts.map(start => start.python))].join("; ")],
@@ -579,4 +592,4 @@ function provenance() {
   page.append(html("footer", {}, `Made by star report, star-rl ${made.version}, ${made.date}.`));
 }
 
-for (const draw of [opening, success, abstraction, strategies, throughput, levels, films, configurations, provenance]) draw();
+for (const draw of [opening, evaluations, abstraction, strategies, throughput, levels, films, configurations, provenance]) draw();

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cache
 from types import NoneType
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, create_model, field_validator
 
+from envs.common import reading
 from envs.common.errors import shown
-from star.config.section import Batch, Positive, Section
+from star.config.section import Positive, Section
 
 
 def _is_simple(value: Any) -> bool:
@@ -40,16 +42,14 @@ class EnvConfig(Section):
 class TrainerConfig(Section):
     """The host loop around the jitted epoch."""
 
-    num_envs: Batch = Field(128, description="environments stepped together, per seed")
     total_env_steps: Annotated[int, Field(gt=0, lt=2**63)] = Field(
-        2_000_000, description="env steps of all environments, per seed; the last epoch is finished"
+        2_000_000, description="env steps, or iterations, per seed; the last epoch is finished"
     )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="first seed")
     num_seeds: Annotated[int, Field(gt=0, le=1024)] = Field(
         1, description="seeds trained side by side: seed, seed + 1, ..."
     )
     eval_every: Positive = Field(2, description="epochs between evaluations")
-    eval_episodes: Batch = Field(100, description="episodes of each evaluation, per seed")
     checkpoint_every: Positive = Field(4, description="epochs between checkpoints")
     keep_checkpoints: Positive = Field(3, description="latest checkpoints kept, besides the best")
     on_non_finite: Literal["stop", "rollback"] = Field(
@@ -61,7 +61,7 @@ class TrainerConfig(Section):
     )
     rollbacks: Positive = Field(3, description="on_non_finite rollback: of one seed, before the run stops after all")
     device: Literal["auto", "cpu", "gpu"] = Field("auto", description="where to train")
-    devices: Positive = Field(1, description="GPUs (or others) that share the environments of each seed")
+    devices: Positive = Field(1, description="GPUs (or others) that share the work of each seed")
     sinks: tuple[Literal["tensorboard", "wandb"], ...] = Field(
         (), description="where metrics go besides metrics.jsonl: tensorboard, wandb"
     )
@@ -73,3 +73,37 @@ class TrainerConfig(Section):
         if twice:
             raise ValueError(f"{twice} is given twice")
         return value
+
+
+class RunConfig(Section):
+    """What every experiment's settings have; it adds its own sections."""
+
+    experiment: str = Field("star", description="what learns: star, or module:name of your own")
+    trainer: TrainerConfig = TrainerConfig()
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        super().__pydantic_init_subclass__(**kwargs)
+        fields = cls.__pydantic_fields__
+        fields["trainer"] = fields.pop("trainer")  # after a kind's own sections
+        cls.model_rebuild(force=True)
+
+    def hyper(self) -> Section:
+        """What the jitted functions see: all but the settings of the run. Its floats are traced."""
+        kind = _hyper(type(self))
+        return kind.model_construct(**{name: getattr(self, name) for name in kind.model_fields})
+
+    def comparable(self) -> dict[str, Any]:
+        """The values that decide whether a checkpoint can go on under other settings."""
+        return self.model_dump(mode="json")
+
+    def to_yaml(self) -> str:
+        """Every resolved value as YAML that `star.config.loading.load` accepts."""
+        return reading.written(self.model_dump(mode="json"))
+
+
+@cache
+def _hyper(config: type[RunConfig]) -> type[Section]:
+    own = {name: field for name, field in config.model_fields.items() if name not in RunConfig.model_fields}
+    parts: dict[str, Any] = {name: (field.annotation, ...) for name, field in own.items()}
+    return create_model(f"{config.__name__}Hyper", __base__=Section, **parts)

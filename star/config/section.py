@@ -64,7 +64,7 @@ def _unflatten(cls: type[Section], static: tuple[Any, ...], leaves: Iterable[Any
 
 
 # Upper bounds are far above what is of use. They keep whole numbers within those of a device, loops and the
-# programs that are compiled of them finite, and what is allocated within what `star.memory` can add up.
+# programs that are compiled of them finite, and what is allocated within what `star.training.memory_budget` can add up.
 Positive = Annotated[int, Field(gt=0, lt=2**31)]
 Batch = Annotated[int, Field(gt=0, le=2**20)]
 Repeats = Annotated[int, Field(gt=0, le=100_000)]

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading
 from star.abstraction import forward_model, reachability
 from star.abstraction.forward_model import Outcome
+from star.config import loading
 
 SPACE = jnp.array([[-4.0, 0.0], [20.0, 10.0]])
 

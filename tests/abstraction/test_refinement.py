@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading
 from star.abstraction import forward_model, refinement, regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.reachability import MISSES, REACHES, UNKNOWN, Leaves
 from star.abstraction.refinement import Goals, Graph
 from star.abstraction.regions import Cut, Split
+from star.config import loading
 from star.learners import replay
 
 R = 6
@@ -24,7 +24,7 @@ def settings(**values):
     # `min_width` and the like are traced, so overrides of floats compile nothing.
     model = {"hidden": [4], "buffer_size": 2000}
     values = {f"refinement.{key}": value for key, value in refine.items()} | values
-    return loading.parse({"forward_model": model, "abstraction": {"max_regions": R}}, values).agent()
+    return loading.parse({"forward_model": model, "abstraction": {"max_regions": R}}, values).hyper()
 
 
 CONFIG = settings()

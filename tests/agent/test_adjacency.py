@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading
 from star.agent import adjacency
+from star.config import loading
 
 SPACE = ((-2.0, 0.0), (4.0, 3.5))  # 6 x 4 cells of side 1
 

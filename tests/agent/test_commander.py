@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading
 from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.regions import Change
 from star.agent import commander, goal_only, planning, values
 from star.agent.decisions import Decision, Finished, Roadmap, Successors, successors
 from star.agent.values import CommanderState, Model
+from star.config import loading
 
 R, N = 5, 40
 

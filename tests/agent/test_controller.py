@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import envs
-from star import loading
 from star.agent import checks, controller
 from star.agent.subgoals import Boxes, Points
 from star.agent.task import Task
+from star.config import loading
 from star.spec import Spec
 
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading
 from star.abstraction import refinement
 from star.abstraction.forward_model import Outcome
 from star.agent import checks, commander, controller, epoch, levels
 from star.agent.decisions import Decision, Finished
 from star.agent.task import Task
+from star.config import loading
 from star.learners import replay
 from star.learners.replay import Transition
 from star.sgim.lessons import Marks
@@ -59,7 +59,7 @@ def test_a_period_is_lost_where_the_task_was_terminated_and_not_where_it_was_tru
 def test_a_period_lost_in_the_last_step_of_an_episode_is_not_counted_as_finished_too(recording):
     # time is up there, so `ended`, which is for ends before it, is 0 though the task terminated
     fatal = (recording.steps.terminated * recording.steps.alive)[:, -1].any(axis=1)
-    config, lost = recording.config.agent(), 0
+    config, lost = recording.config.hyper(), 0
     task, roadmap = Task.of(config, recording.spec), SimpleNamespace(abstraction=recording.abstraction)
     for i in np.flatnonzero(fatal):
         memory, passed = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (recording.commanded, recording.passed))
@@ -170,7 +170,7 @@ class Epoch:
             return epoch.epoch(agent, self.spec, env, state)
 
         self.one = jax.jit(once)
-        self.init = jax.jit(lambda key: levels.init(self.config.agent(), self.spec, key=key))
+        self.init = jax.jit(lambda key: levels.init(self.config.hyper(), self.spec, key=key))
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +182,7 @@ def jitted(breaking_env, tiny):
 def first(jitted):
     """Start and end of a first epoch."""
     start = jitted.init(jax.random.key(0))
-    return start, *jitted.one(jitted.config.agent(), start)
+    return start, *jitted.one(jitted.config.hyper(), start)
 
 
 def stack(*trees):
@@ -239,14 +239,14 @@ def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(fi
 
 def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neither(jitted, first, tiny):
     _, state, _ = first
-    state, _ = jitted.one(jitted.config.agent(), state)
+    state, _ = jitted.one(jitted.config.hyper(), state)
     other = loading.parse(tiny, {"commander.discount": 0.5, "tutor.reward_scale": 0.3})
-    jitted.one(other.agent(), state)
+    jitted.one(other.hyper(), state)
     assert jitted.traces == 1
 
 
 def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
-    config, spec = jitted.config.agent(), jitted.spec
+    config, spec = jitted.config.hyper(), jitted.spec
     state = jitted.init(jax.random.key(0))
     before = state.abstraction
     capacity = before.capacity
@@ -341,7 +341,7 @@ def test_levels_can_be_left_out(request, name):
     """Both levels are left out in `test_trainer.py`."""
     agent = request.getfixturevalue(name)
     start = agent.init(jax.random.key(0))
-    end, metrics = agent.one(agent.config.agent(), start)
+    end, metrics = agent.one(agent.config.hyper(), start)
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), start.controller.params, end.controller.params)
     assert any(jax.tree.leaves(moved))
     assert (end.tutor is None) == ("tutor/kl" not in metrics) == (name == "gara")
@@ -353,7 +353,7 @@ def test_levels_can_be_left_out(request, name):
 @pytest.mark.parametrize("tutored", [True, False])
 def test_hindsight_makes_what_was_reached_the_subgoal_of_half_of_the_batch(breaking_env, tiny, tutored):
     learner = {"controller.learner": "td3", "controller.hindsight": True, "tutor.enabled": tutored}
-    agent, spec = loading.parse(tiny, learner).agent(), Spec.of(breaking_env.env)
+    agent, spec = loading.parse(tiny, learner).hyper(), Spec.of(breaking_env.env)
     rng = np.random.default_rng(0)
     n, size = 400, 2 if tutored else 4
     reached = rng.normal(size=(n, 2, 2)).astype(np.float32)
@@ -385,7 +385,7 @@ def test_hindsight_makes_what_was_reached_the_subgoal_of_half_of_the_batch(break
 
 def test_a_termination_costs_its_penalty(recording):
     passed = jax.tree.map(lambda x: jnp.asarray(x[0]), recording.passed)
-    config = recording.config.agent()
+    config = recording.config.hyper()
     paid, less = (
         controller.experience(
             config.controller.model_copy(update={"termination_penalty": price}),
@@ -405,7 +405,7 @@ def test_an_epoch_charges_for_tilts_by_the_env_steps_before_it(hrac):
     values = loading.parse(hrac.config.model_dump(mode="json"), {f"controller.{key}": x for key, x in rising.items()})
     start = hrac.init(jax.random.key(0))
     first, middle, last = (
-        float(hrac.one(values.agent(), start.replace(epoch=start.epoch + done))[1]["controller/reward"])
+        float(hrac.one(values.hyper(), start.replace(epoch=start.epoch + done))[1]["controller/reward"])
         for done in (0, 1, 2)
     )
     assert hrac.traces == 1

@@ -9,12 +9,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import envs
-from star import loading
 from star.abstraction import regions
 from star.agent import commander, levels, play
 from star.agent.decisions import Roadmap, Scene, target_box
 from star.agent.segments import Choice
 from star.agent.task import Task
+from star.config import loading
 from star.sgim.lessons import Marks
 from star.spec import Spec
 
@@ -240,7 +240,7 @@ def test_the_pose_adds_a_vector_of_the_length_of_the_heading_that_points_where_t
 
 def test_subgoals_with_a_heading_stay_where_they_are_while_the_agent_moves_and_turns(breaking_env, tiny, turning):
     spec = turning
-    agent = loading.parse(tiny).agent()
+    agent = loading.parse(tiny).hyper()
 
     def rolled(key):
         state = levels.init(agent, spec, key=key)
@@ -264,7 +264,7 @@ def scene_of(spec, env_state):
 
 @pytest.mark.parametrize("hold", [True, False, "region"])
 def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_env, tiny, hold):
-    agent = loading.parse(tiny, {"commander.hold": hold}).agent()
+    agent = loading.parse(tiny, {"commander.hold": hold}).hyper()
     spec = Spec.of(breaking_env.env)
 
     def commanded(key):
@@ -295,7 +295,7 @@ def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_e
 
 @pytest.mark.parametrize("arrival", [True, False])
 def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, tiny, arrival, monkeypatch):
-    agent = loading.parse(tiny, {"commander.arrival": arrival}).agent()
+    agent = loading.parse(tiny, {"commander.arrival": arrival}).hyper()
     spec = replace(Spec.of(breaking_env.env), episode_length=7 * L)
 
     def played(key):
@@ -323,7 +323,7 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
 
 
 def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
-    agent = loading.parse(tiny).agent()
+    agent = loading.parse(tiny).hyper()
     state = levels.init(agent, Spec.of(breaking_env.env), key=jax.random.key(0))
     roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
     short, one = (
@@ -335,7 +335,7 @@ def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
 
 @pytest.mark.parametrize("retry", [0.9, 0.5, 1.0])
 def test_who_comes_back_to_a_region_makes_less_of_what_it_was_told_there(breaking_env, tiny, retry):
-    agent = loading.parse(tiny, {"commander.retry": retry, "commander.hold": False}).agent()
+    agent = loading.parse(tiny, {"commander.retry": retry, "commander.hold": False}).hyper()
     spec = replace(Spec.of(breaking_env.env), episode_length=40 * L)
     state = levels.init(agent, spec, key=jax.random.key(0))
     n, rng = int(state.abstraction.count), np.random.default_rng(0)

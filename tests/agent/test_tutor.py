@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading
 from star.abstraction.regions import Box
 from star.agent import tutor
 from star.agent.task import Task
 from star.agent.tutor import Trace
+from star.config import loading
 from star.learners.replay import Transition
 from star.spec import Spec
 

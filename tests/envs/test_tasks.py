@@ -11,7 +11,8 @@ from scipy import stats
 
 import envs
 from envs import maze
-from envs.tasks import TASKS, Places
+from envs.places import Places
+from envs.tasks import TASKS
 
 DRAWS = 10_000
 ANT_TASKS = [name for name in envs.names() if name.startswith("ant_")]

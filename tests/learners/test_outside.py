@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from envs.common.errors import UserError
-from star import loading
-from star.checkpoint import opened
 from star.cli import main
+from star.config import loading
+from star.training.checkpoint import opened
 from tests.small import EPOCH, RUN
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto.md"
@@ -110,5 +110,5 @@ def test_its_settings_survive_the_way_through_a_file_and_can_be_swept(here, monk
     assert again == first and again.controller.own.std == 0.25
     import jax
 
-    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(first.agent())[0]]
+    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_flatten_with_path(first.hyper())[0]]
     assert ".controller.own.std" in names and ".tutor.own.std" not in names

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading
+from star.config import loading
 from star.learners import ppo
 from star.learners.replay import Transition
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star import loading
+from star.config import loading
 from star.learners import replay, td3
 from star.learners.replay import Transition
 

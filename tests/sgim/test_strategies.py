@@ -7,12 +7,12 @@ import pytest
 from scipy import stats
 
 from envs.common.errors import UserError
-from star import loading
 from star.abstraction import regions
 from star.abstraction.regions import Change, Cut, Split
 from star.agent import commander, levels, play, q_learning, tutor, values
 from star.agent import epoch as learning
 from star.agent.decisions import Decision, Roadmap, Scene, Successors
+from star.config import loading
 from star.learners import ppo, td3
 from star.learners.replay import Imitation, Transition
 from star.sgim import lessons, selection, strategies
@@ -80,7 +80,7 @@ def test_nothing_is_kept_where_everything_is_left_as_ever(tiny, breaking_env):
     spec = Spec.of(breaking_env.env)
 
     def kept(values):
-        return levels.init(loading.parse({**tiny, "sgim": values}).agent(), spec, key=jax.random.key(0)).sgim
+        return levels.init(loading.parse({**tiny, "sgim": values}).hyper(), spec, key=jax.random.key(0)).sgim
 
     assert kept({}) is None
     for some in ({"goals": True}, {"exploration": True}, {"refinement": True}, {"teachers": [GUIDE]}):
@@ -441,10 +441,10 @@ def schooled(tiny, breaking_env):
     @jax.jit
     def epoch(state):
         traces.append(0)
-        return learning.epoch(parsed.agent(), spec, breaking_env, state, teachers)
+        return learning.epoch(parsed.hyper(), spec, breaking_env, state, teachers)
 
     # With this key a region is cut, which is rare in so few epochs.
-    state = jax.jit(lambda key: levels.init(parsed.agent(), spec, key=key))(jax.random.key(22))
+    state = jax.jit(lambda key: levels.init(parsed.hyper(), spec, key=key))(jax.random.key(22))
     seen, metrics = [state], []
     for _ in range(3):
         state, more = epoch(state)
@@ -468,7 +468,7 @@ def test_sgim_follows_the_agent_through_its_epochs(schooled):
 
 
 def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env):
-    agent, spec = loading.parse({**tiny, "sgim": {"goals": True}}).agent(), Spec.of(breaking_env.env)
+    agent, spec = loading.parse({**tiny, "sgim": {"goals": True}}).hyper(), Spec.of(breaking_env.env)
     before = levels.init(agent, spec, key=jax.random.key(0))
     last = int(before.abstraction.count)
     cuts = [Cut(jnp.int32(15), jnp.int32(0), jnp.float32(9.0)), Cut(jnp.int32(last), jnp.int32(1), jnp.float32(5.0))]
@@ -516,7 +516,7 @@ def commanded_in(playing, state, streams, lesson, *, key):
 
 def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(tiny, breaking_env):
     agent, spec = (
-        loading.parse({**tiny, "sgim": {"teachers": [GUIDE], "waypoint_radius": 0.01}}).agent(),
+        loading.parse({**tiny, "sgim": {"teachers": [GUIDE], "waypoint_radius": 0.01}}).hyper(),
         Spec.of(breaking_env.env),
     )
     n = breaking_env.num_envs
@@ -551,7 +551,7 @@ def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(t
 def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_tutor_imitates_them(
     tiny, breaking_env, turning, monkeypatch
 ):
-    agent = loading.parse({**tiny, "sgim": {"teachers": [GUIDE], "imitation": 2.0}}).agent()
+    agent = loading.parse({**tiny, "sgim": {"teachers": [GUIDE], "imitation": 2.0}}).hyper()
     lesson, _, _, _ = lesson_of(agent.sgim)
     n = breaking_env.num_envs
     lesson = jax.tree.map(lambda x: x[:n], lesson)
@@ -598,7 +598,7 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
 
 
 def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, breaking_env):
-    agent, spec = loading.parse({**tiny, "sgim": {"teachers": [GUIDE]}}).agent(), Spec.of(breaking_env.env)
+    agent, spec = loading.parse({**tiny, "sgim": {"teachers": [GUIDE]}}).hyper(), Spec.of(breaking_env.env)
     state = levels.init(agent, spec, key=jax.random.key(0))
     i, j = map(
         int,
@@ -618,7 +618,7 @@ def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, bre
 
 def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, breaking_env):
     own = {"strategies": ["autonomous", "babbling", "decomposition"], "waypoint_radius": 0.01}
-    agent, spec = loading.parse({**tiny, "sgim": own}).agent(), Spec.of(breaking_env.env)
+    agent, spec = loading.parse({**tiny, "sgim": own}).hyper(), Spec.of(breaking_env.env)
     lesson = jax.tree.map(lambda x: x[: breaking_env.num_envs], lesson_of(agent.sgim)[0])
     babbling, detour = (np.asarray(lesson.choice.strategy) == number for number in (1, 2))
     assert babbling.any() and detour.any() and not (babbling | detour).all()

@@ -1,0 +1,90 @@
+"""Statistics of greedy episodes of one seed, and of the way to their goals. The equations are in docs/evaluation.md."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float
+
+from star.agent.play import Episode
+from star.report import statistics
+
+MEASURES = ("success_any", "success_final")
+
+
+class Trials(struct.PyTreeNode):
+    """Greedy episodes and what it took to reach their goals, leading axes [E] or [S, E].
+
+    `steps` and `path` count env steps and m of the abstract position until the goal is first reached, or those of the
+    whole episode where it is not. `start` is the abstract position at the start.
+    """
+
+    episode: Episode
+    steps: Float[Array, "*E"]
+    path: Float[Array, "*E"]
+    start: Float[Array, "*E d"]
+    goal: Float[Array, "*E k"]
+
+
+def summarise(episode: Episode) -> dict[str, Any]:
+    """Statistics of the episodes of one seed (arrays [E]).
+
+    `success_any` and `success_final` come with Wilson score intervals, `distance` (units of the state, at the end of
+    the episode) and `return` (sum of the task's rewards) with Student's t intervals. `flipped` is the share that ends
+    with the body on its back, `failed_flipped` the same of those that never reach the goal, None if all do. Keys ending
+    in `_interval` hold [low, high] at 95 %.
+    """
+    any_, final, distance, total, flipped = (
+        np.asarray(x, np.float64).ravel()
+        for x in (episode.success_any, episode.success_final, episode.distance, episode.total, episode.flipped)
+    )
+    return {
+        "episodes": len(any_),
+        "success_any": float(any_.mean()),
+        "success_any_interval": statistics.proportion_interval(int(any_.sum()), len(any_)),
+        "success_final": float(final.mean()),
+        "success_final_interval": statistics.proportion_interval(int(final.sum()), len(final)),
+        "distance": float(distance.mean()),
+        "distance_interval": statistics.mean_interval(distance),
+        "return": float(total.mean()),
+        "return_interval": statistics.mean_interval(total),
+        "flipped": float(flipped.mean()),
+        "failed_flipped": float(flipped[any_ == 0].mean()) if (any_ == 0).any() else None,
+    }
+
+
+def summarise_way(trials: Trials, shortest: np.ndarray | None, *, dt: float) -> dict[str, Any]:
+    """What it takes to reach the goal: `steps_to_goal`, `seconds_to_goal`, `path_length` (m), and `spl`.
+
+    The first three are means over the episodes that reach it, with Student's t intervals, None if none does. `shortest`
+    are the lengths of the shortest ways (m, infinite where there is none), like `trials.path`; without them `spl` is
+    None. `dt` is the length of an env step (s).
+    """
+    reached, steps, path = (
+        np.asarray(x, np.float64).ravel() for x in (trials.episode.success_any, trials.steps, trials.path)
+    )
+    found: dict[str, Any] = {}
+    for name, values in (("steps_to_goal", steps), ("seconds_to_goal", steps * dt), ("path_length", path)):
+        values = values[reached > 0]
+        found |= {
+            name: float(values.mean()) if len(values) else None,
+            f"{name}_interval": statistics.mean_interval(values) if len(values) else None,
+        }
+    weighted = np.empty(0) if shortest is None else weighted_success(reached, path, np.ravel(shortest))
+    return found | {
+        "spl": float(weighted.mean()) if len(weighted) else None,
+        "spl_interval": statistics.mean_interval(weighted) if len(weighted) else None,
+    }
+
+
+def weighted_success(reached: np.ndarray, path: np.ndarray, shortest: np.ndarray) -> np.ndarray:
+    """Success weighted by path length (Anderson et al. 2018) of every episode that has a shortest way at all.
+
+    1 for who goes the shortest way, 0 for who does not arrive. Who begins at the goal has nowhere to go: 1.
+    """
+    there = np.isfinite(shortest)
+    reached, path, shortest = reached[there], path[there], shortest[there]
+    longer = np.maximum(path, shortest)
+    return reached * np.divide(shortest, longer, out=np.ones_like(longer), where=shortest > 0)

@@ -1,0 +1,138 @@
+"""Evaluations as tables for people."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from star.agent.episodes import MEASURES
+from star.report.statistics import ABOVE
+
+_PLAIN_WIDTH = 200  # columns where nobody looks at a terminal
+_SHOWN = 3  # failed episodes named in a table
+
+Row = Mapping[str, Any]
+
+
+def show(rows: Sequence[Row], comparison: Mapping[str, Any] | None, *, again: str) -> None:
+    """Print the rows of `star.agent.exams.evaluate`, a line for each seed, and what `compare` found.
+
+    `again` are the arguments that tell `star render` of which evaluation an episode is.
+    """
+    console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH, highlight=False)
+    console.print(evaluations(rows))
+    failing = next(((row, seed) for row in rows for seed in row["seeds"] if seed["failed"]), None)
+    if failing:
+        row, seed = failing
+        words = ["star", "render", "--run", row["run"], "--checkpoint", str(row["env_steps"])]
+        words += ["--seed", str(seed["seed"]), "--episode", str(seed["failed"][0])]
+        print(f"watch a failure: {shlex.join(words)} {again}{' ' * bool(again)}--out failure.html")
+    if comparison:
+        console.print(groups(comparison["groups"]))
+        if comparison["improvement"]:
+            console.print(improvements(comparison["improvement"]))
+
+
+def evaluations(rows: Sequence[Row]) -> Table:
+    """A line for each seed of each checkpoint, and one for all seeds where there are several."""
+    table = Table(title=_title(rows), box=box.SIMPLE_HEAD)
+    about = [name for name in ("run", "env") if len({row[name] for row in rows}) > 1]
+    for name in about:
+        table.add_column(name)
+    for name in ("env steps", "seed", "episodes"):
+        table.add_column(name, justify="right")
+    for name in ("success_any", "success_final", "s to goal", "m to goal", "SPL", "end distance"):
+        table.add_column(name, justify="right")
+    table.add_column("failed")
+    several = any(len(row["seeds"]) > 1 for row in rows)
+    if several:
+        table.add_column(f"seeds above {ABOVE:g}")
+    for row in rows:
+        begin: list[Text | str] = [*(Text(row[name]) for name in about), f"{row['env_steps']:,}"]
+        for seed in row["seeds"]:
+            failed = [str(number) for number in seed["failed"][:_SHOWN]]
+            more = " ..." * (len(seed["failed"]) > _SHOWN)
+            table.add_row(*begin, str(seed["seed"]), *_cells(seed), " ".join(failed) + more)
+        if len(row["seeds"]) > 1:
+            over = {f"{name}_interval": row[f"{name}_seeds_interval"] for name in MEASURES}
+            learnt = "\n".join(f"{name}: {_above(row[f'{name}_above'])}" for name in MEASURES)
+            table.add_row(*begin, "all", *_cells({**row, **over}), "", learnt)
+    return table
+
+
+def groups(found: Sequence[Row]) -> Table:
+    """Means of groups of runs, and how many of their seeds have learnt the task."""
+    table = Table(box=box.SIMPLE_HEAD, title="mean over seeds and tasks, 95 % intervals")
+    if any(group["success_any"]["mean_interval"] is None for group in found):
+        table.caption = "one seed of a task has no interval"
+    for name in ("group", "runs", "seeds", *MEASURES, *(f"{name} above {ABOVE:g}" for name in MEASURES)):
+        table.add_column(name, justify="left" if name == "group" else "right")
+    for group in found:
+        seeds = sum(len(scores) for scores in group["success_any"]["scores"].values())
+        measured = [_interval(group[name]["mean"], group[name]["mean_interval"]) for name in MEASURES]
+        learnt = [_above(group[name]["above"]) for name in MEASURES]
+        table.add_row(Text(group["name"]), str(len(group["runs"])), str(seeds), *measured, *learnt)
+    return table
+
+
+def improvements(found: Sequence[Row]) -> Table:
+    """How much better one group is than another; each pair once, in the order of the groups."""
+    table = Table(box=box.SIMPLE_HEAD, title="difference of means A - B, 95 % intervals (Welch), and P(A > B) of seeds")
+    if any(pair["success_any"] is None for pair in found):
+        table.caption = "-: no task in common"
+    table.add_column("A")
+    table.add_column("B")
+    for name in MEASURES:
+        table.add_column(name, justify="right")
+        table.add_column("P", justify="right")
+    seen: set[frozenset[str]] = set()
+    for pair in found:
+        both = frozenset((pair["better"], pair["than"]))
+        if both in seen:
+            continue
+        seen.add(both)
+        measured = []
+        for name in MEASURES:
+            measured += [
+                _interval(pair[f"{name}_difference"], pair[f"{name}_difference_interval"]),
+                "-" if pair[name] is None else f"{pair[name]:.2f}",
+            ]
+        table.add_row(Text(pair["better"]), Text(pair["than"]), *measured)
+    return table
+
+
+def _title(rows: Sequence[Row]) -> str:
+    side = rows[0]["goals"].removeprefix("grid ")
+    goals = "test goals" if rows[0]["goals"] == "test" else f"goals on a grid of {side} x {side}"
+    tasks = dict.fromkeys(f"{row['env']} ({row['engine']})" for row in rows)
+    return f"{', '.join(tasks)}: {goals}, 95 % intervals"
+
+
+def _cells(row: Row) -> list[str]:
+    success = [_interval(row[name], row[f"{name}_interval"]) for name in MEASURES]
+    means = (("seconds_to_goal", ".1f"), ("path_length", ".1f"), ("spl", ".2f"), ("distance", ".2f"))
+    return [str(row["episodes"]), *success, *("-" if row[name] is None else format(row[name], f) for name, f in means)]
+
+
+def _above(found: Row) -> str:
+    """`4 of 5 [0.28, 0.99]`."""
+    low, high = found["interval"]
+    return escape(f"{found['seeds']} of {found['of']} [{low:.2f}, {high:.2f}]")
+
+
+def _interval(value: float | None, interval: Sequence[float] | None) -> str:
+    """`value [low, high]` of a share, without an interval where there is none, or a dash."""
+    if value is None:
+        return "-"
+    if interval is None:
+        return f"{value:.3f}"
+    low, high = interval
+    return escape(f"{value:.3f} [{low:.3f}, {high:.3f}]")

@@ -1,0 +1,313 @@
+"""Evaluation afterwards: many checkpoints of many runs, on test goals or a grid of them, in their own task or another.
+
+prepare   the environment, the goals and one compiled function for all agents of one structure
+evaluate  every checkpoint in turn: a row of plain values each
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from envs import routes
+from envs.common import modes
+from envs.vector import VectorEnv
+from star.agent.episodes import MEASURES, Trials, summarise, summarise_way
+from star.agent.experiment import make_env
+from star.agent.play import Episode, greedy
+from star.agent.sections import Config
+from star.config.loading import parse
+from star.config.section import ConfigError
+from star.report import statistics
+from star.spec import Spec
+from star.training import checkpoint
+from star.training import program as programs
+from star.training.checkpoint import Checkpoints
+from star.training.compatibility import check_compatible
+from star.training.program import Program
+
+FAILED = 10  # episodes that failed, named for each seed
+
+
+@dataclass(frozen=True)
+class Exam:
+    """What agents are to do: `grid` None means the test goals, N a grid of N x N; `seed` chooses starts and goals.
+
+    `task` are dotted settings of the task, `env.name` and `env.options`, where they are not to be those of training.
+    """
+
+    grid: int | None = None
+    seed: int = 0
+    task: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def goals(self) -> str:
+        """The goals in words."""
+        return "test" if self.grid is None else f"grid {self.grid}"
+
+
+@dataclass(frozen=True)
+class Target:
+    """Checkpoints of a run: "last", "best", "all" or env steps. `config` is the run's own."""
+
+    run_dir: Path
+    checkpoint: str
+    config: Config
+
+
+@dataclass(frozen=True)
+class Course:
+    """What agents of one structure are evaluated on. `program` is that of their training.
+
+    `options` are those of the task. `goals` [E, k] are the goals of the episodes, None if the task draws them, and
+    `cells` [G, 4] the rectangles that they are the middles of, one after another.
+    """
+
+    program: Program
+    env: Any
+    spec: Spec
+    options: dict[str, Any]
+    goals: jax.Array | None
+    cells: np.ndarray | None
+
+
+def prepare(config: Config, exam: Exam, *, episodes: int, source: Path) -> Course:
+    """The course of `episodes` episodes for the agents of the run `source`, whose settings are `config`.
+
+    Raises:
+      UserError: in one line, if they cannot act there, or there are not as many episodes as goals.
+    """
+    program = programs.build(config)
+    task = elsewhere(config, exam.task)
+    env = make_env(task, "test")
+    spec = _fitting(program, env, source=source)
+    goals = cells = None
+    if exam.grid is not None:
+        cells = env.arena.grid(exam.grid)
+        if not len(cells):
+            raise ConfigError(f"--grid: {exam.grid} puts no goal on a free floor of {env.name}")
+        if len(cells) > episodes:
+            raise ConfigError(
+                f"--grid: {exam.grid} makes {len(cells)} goals, more than the {episodes} episodes; "
+                f"allowed: a smaller grid, or --episodes {len(cells)} and more"
+            )
+        goals = jnp.asarray(_goals(env, (cells[:, :2] + cells[:, 2:]) / 2)[np.arange(episodes) % len(cells)])
+    return Course(program, env, spec, task.env.options, goals, cells)
+
+
+def elsewhere(config: Config, task: Mapping[str, Any]) -> Config:
+    """`config` with the settings `task` of the environment; those of another task begin with its defaults."""
+    env = config.env.model_dump(mode="json")
+    if task.get("env.name", config.env.name) != config.env.name:
+        env |= {"options": {}}
+    return parse(config.model_dump(mode="json") | {"env": env}, task)
+
+
+def _fitting(program: Program, env: Any, *, source: Path) -> Spec:
+    """What the levels trained by `program` know of `env`: their own space and subgoals, and where its goals are."""
+    trained, here = program.experiment.spec, Spec.of(env, heading=program.experiment.spec.heading)
+    for words, name in (("a state of", "state_dim"), ("actions of", "action_size")):
+        here_size, trained_size = getattr(here, name), getattr(trained, name)
+        if here_size != trained_size:
+            raise ConfigError(
+                f"env: {env.name} has {words} {here_size} numbers, the agent of {source} was trained with "
+                f"{trained_size} ({program.config.env.name})"
+            )
+    if here.orientation != trained.orientation:
+        raise ConfigError(f"env: {env.name} has another body than {program.config.env.name}, see {source}")
+    period = program.config.tutor.period
+    if here.episode_length % period:
+        raise ConfigError(
+            f"env.options.episode_length: {here.episode_length} is not a multiple of tutor.period {period} of {source}"
+        )
+    return trained.within(env)
+
+
+def _goals(env: Any, middles: np.ndarray) -> np.ndarray:
+    """Goals [G, k] at `middles` [G, 2]; what else there is in a goal is as in a test goal."""
+    goals = np.repeat(np.asarray(env.reset(modes.key(0)).obs[None, env.state_dim :]), len(middles), axis=0)
+    goals[:, _xy(env.goal_indices)] = middles
+    return goals
+
+
+def _xy(indices: Sequence[int]) -> list[int]:
+    """Where x and y, the first two numbers of a state, are among `indices`."""
+    return [indices.index(0), indices.index(1)]
+
+
+def player(course: Course, episodes: int) -> Callable[[Any, Any, jax.Array], Trials]:
+    """The jitted function from the settings, states and keys of S seeds to their trials [S, E]."""
+    spec, tested = course.spec, VectorEnv(course.env, episodes, auto_reset=False)
+
+    def look(env_state: Any, *_: Any) -> tuple[jax.Array, jax.Array]:
+        return spec.abstract(env_state.obs), env_state.metrics["success"]
+
+    def one(agent: Any, state: Any, key: jax.Array) -> Trials:
+        streams, moments = greedy(agent, spec, tested, state, goals=course.goals, record=look, key=key)
+        position, success = jax.tree.map(
+            lambda many, end: jnp.concatenate([many, end[None]]), moments, look(streams.env)
+        )
+        return measure(streams.episode, position, success, goal=spec.goal(streams.env.obs))
+
+    return jax.jit(lambda agent, states, keys: jax.vmap(lambda state, key: one(agent, state, key))(states, keys))
+
+
+def measure(ended: Episode, position: jax.Array, success: jax.Array, *, goal: jax.Array) -> Trials:
+    """What E episodes took, from `position` [T + 1, E, d] and `success` [T + 1, E] at every moment.
+
+    As in the statistics of episodes, the moment before the first step does not count as success.
+    """
+    reached = success[1:] > 0
+    steps = jnp.where(reached.any(axis=0), jnp.argmax(reached, axis=0) + 1, len(reached))
+    legs = jnp.linalg.norm(position[1:] - position[:-1], axis=-1)
+    path = jnp.where(jnp.arange(len(legs))[:, None] < steps, legs, 0.0).sum(axis=0)
+    return Trials(episode=ended, steps=steps.astype(jnp.float32), path=path, start=position[0], goal=goal)
+
+
+def evaluate(targets: Sequence[Target], exam: Exam, *, quiet: bool = True) -> list[dict[str, Any]]:
+    """A row of plain values for every checkpoint, in the order of `targets`.
+
+    Agents whose settings agree in structure share what is compiled. The config in every checkpoint is looked at before
+    the first episode is played.
+
+    Raises:
+      UserError: in one line, for whatever cannot be evaluated.
+    """
+    console = Console(stderr=True)
+    busy = contextlib.nullcontext() if quiet or not console.is_terminal else console.status("preparing")
+    with contextlib.ExitStack() as stack:
+        status = stack.enter_context(busy)
+        entries = list(_plan(targets, exam, stack))
+        rows = []
+        for number, entry in enumerate(entries):
+            if status is not None:
+                status.update(f"checkpoint {number + 1} of {len(entries)}")
+            state = checkpoint.restore(entry.program, entry.checkpoints, entry.step, source=entry.run_dir)
+            keys = entry.program.evaluation_keys(exam.seed, stream=programs.AFTERWARDS)
+            trials = jax.device_get(entry.play(entry.program.config.hyper(), state, keys))
+            rows.append(_row(entry, exam, trials, entry.shortest(trials)))
+    return rows
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A checkpoint to evaluate, and what does it. `program` is that of the course with the run's own settings."""
+
+    run_dir: Path
+    step: int
+    checkpoints: Checkpoints
+    program: Program
+    course: Course
+    play: Callable[[Any, Any, jax.Array], Trials]
+    ways: dict[bytes, np.ndarray | None]
+
+    def shortest(self, trials: Trials) -> np.ndarray | None:
+        """The shortest ways [S, E] of `trials`, worked out once: all checkpoints have the same starts and goals."""
+        key = trials.start.tobytes() + trials.goal.tobytes()
+        if key not in self.ways:
+            self.ways[key] = shortest_ways(self.course, trials)
+        return self.ways[key]
+
+
+def _plan(targets: Sequence[Target], exam: Exam, stack: contextlib.ExitStack) -> Iterator[_Entry]:
+    """The checkpoints that are asked for, each once."""
+    courses: dict[Any, tuple[Course, Any, dict]] = {}
+    seen: set[tuple[Path, int]] = set()
+    for target in targets:
+        config, source = target.config, target.run_dir
+        checkpoints = stack.enter_context(checkpoint.opened(source))
+        steps = checkpoints.steps()
+        if target.checkpoint != "all" or not steps:
+            steps = [checkpoint.choose(checkpoints, source, target.checkpoint)]
+        else:
+            for step in steps:
+                checkpoints.check(step)
+        structure = _structure(config)
+        if structure not in courses:
+            episodes = config.trainer.eval_episodes
+            course = prepare(config, exam, episodes=episodes, source=source)
+            courses[structure] = (course, player(course, episodes), {})
+        course, play, ways = courses[structure]
+        own = course.program.experiment.resolve(config)
+        program = dataclasses.replace(course.program, config=own)
+        for step in steps:
+            if (source.resolve(), step) not in seen:
+                check_compatible(checkpoints.config(step), own, source=source)
+                seen.add((source.resolve(), step))
+                yield _Entry(source, step, checkpoints, program, course, play, ways)
+
+
+def _structure(config: Config) -> Any:
+    """What two runs have in common that can be evaluated with one compiled function: all but numbers and seeds."""
+    env = json.dumps(config.env.model_dump(mode="json"), sort_keys=True)
+    return jax.tree.structure(config.hyper()), env, config.trainer.num_envs, config.trainer.eval_episodes
+
+
+def shortest_ways(course: Course, trials: Trials) -> np.ndarray | None:
+    """Lengths, like `trials.path`, of the shortest ways from the starts until within reach of the goals (m).
+
+    None where the map alone does not tell, see `envs.routes.distances`.
+    """
+    starts = np.asarray(trials.start)[..., _xy(course.spec.abstract_indices)].reshape(-1, 2)
+    goals = np.asarray(trials.goal)[..., _xy(course.spec.goal_indices)].reshape(-1, 2)
+    found = routes.distances(course.env.arena, starts, goals)
+    if found is None:
+        return None
+    return np.maximum(found - course.spec.success_radius, 0.0).reshape(trials.path.shape)
+
+
+def _row(entry: _Entry, exam: Exam, trials: Trials, shortest: np.ndarray | None) -> dict[str, Any]:
+    course, dt = entry.course, entry.course.env.dt
+
+    def summary(trials: Trials, shortest: np.ndarray | None) -> dict[str, Any]:
+        return summarise(trials.episode) | summarise_way(trials, shortest, dt=dt)
+
+    per_seed = []
+    for i, seed in enumerate(entry.program.seeds):
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], trials)
+        failed = np.flatnonzero(one.episode.success_any == 0)[:FAILED].tolist()
+        own = None if shortest is None else shortest[i]
+        per_seed.append({"seed": seed} | summary(one, own) | {"failed": failed})
+    row = {
+        "run": str(entry.run_dir),
+        "env": course.env.name,
+        "options": course.options,
+        "engine": course.env.engine,
+        "env_steps": entry.step,
+        "goals": exam.goals,
+    }
+    row |= summary(trials, shortest)
+    if len(per_seed) > 1:
+        for measure in MEASURES:
+            scores = [seed[measure] for seed in per_seed]
+            _, low, high = statistics.over_seeds(np.asarray(scores), episodes=per_seed[0]["episodes"])
+            row |= {
+                f"{measure}_seeds_interval": [float(low), float(high)],
+                f"{measure}_above": statistics.above(scores),
+            }
+    if course.cells is not None:
+        row |= {"per_goal": per_goal(course.cells, trials), "walls": course.env.arena.walls().tolist()}
+    return row | {"seeds": per_seed}
+
+
+def per_goal(cells: np.ndarray, trials: Trials) -> list[dict[str, Any]]:
+    """Success for each of the goals [G] in `cells`, which the episodes of all seeds take in turn."""
+    number = np.arange(trials.path.shape[-1]) % len(cells)
+    return [
+        {
+            "cell": cell.tolist(),
+            "episodes": int((number == i).sum() * len(trials.path)),
+            **{name: float(getattr(trials.episode, name)[:, number == i].mean()) for name in MEASURES},
+        }
+        for i, cell in enumerate(cells)
+    ]

@@ -1,0 +1,200 @@
+"""STAR as an experiment: environments, the three levels that learn in them, and what people see of both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+import envs
+from envs import arena
+from envs.common import files, modes, reading
+from envs.options import normal
+from envs.vector import VectorEnv
+from star import devices, learners
+from star.agent import checks, figures, levels, memory, play
+from star.agent import epoch as learning
+from star.agent.episodes import summarise
+from star.agent.play import Episode
+from star.agent.sections import AgentConfig, Config
+from star.agent.state import TrainState
+from star.config.loading import parse
+from star.config.section import ConfigError
+from star.sgim import teachers
+from star.sgim.sections import TeacherConfig
+from star.sgim.teachers import Demonstrations
+from star.spec import Spec
+from star.training.experiment import Experiment, over_seeds
+from star.training.journal import mean
+
+_EVALUATED = ("success_any", "success_final", "distance", "return", "flipped")
+_SHARE = "sgim/share_"
+_FAULTS = ("env/non_finite", "env/overflow")
+
+
+class Star(Experiment):
+    """Three levels in an environment."""
+
+    def __init__(self, config: Config) -> None:
+        env, test_env = (make_env(config, goals) for goals in ("train", "test"))
+        self.spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
+        """What the levels know of the environment."""
+        super().__init__(resolve(config, env.engine, self.spec))
+        config = self.config
+        try:
+            checks.check(config, self.spec)
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        self.env, self.test_env = env, test_env
+        self._trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
+        surplus = -config.trainer.eval_episodes % config.trainer.devices  # each device plays as many
+        self._tested = VectorEnv(test_env, config.trainer.eval_episodes + surplus, auto_reset=False)
+        self._on_test = self.spec.within(test_env)
+        if self._on_test.episode_length % config.tutor.period:
+            raise ConfigError(
+                f"tutor.period: {config.tutor.period} does not divide the test episode of "
+                f"{self._on_test.episode_length}"
+            )
+        self.steps_per_epoch = config.trainer.num_envs * self.spec.episode_length
+        self.walls = np.asarray(env.arena.walls())
+        self.goal = _a_goal(self.spec, test_env)
+        """A test goal as an abstract point [d]: the one of the task, or one of several."""
+
+    def resolve(self, config: Config) -> Config:
+        """`config` with what is really used here."""
+        return resolve(config, self.config.env.engine, self.spec)
+
+    def data(self) -> tuple[Demonstrations, ...]:
+        """What the teachers show."""
+        config = self.config
+        return tuple(_demonstrations(config, one, self.env, self.test_env, self.spec) for one in config.sgim.teachers)
+
+    @over_seeds
+    def init(self, hyper: AgentConfig, key: jax.Array) -> TrainState:
+        """A fresh run."""
+        return levels.init(hyper, self.spec, key=key)
+
+    @over_seeds
+    def epoch(self, hyper: AgentConfig, data: Any, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        """An episode of every environment, and what is learnt from it."""
+        return learning.epoch(hyper, self.spec, self._trained, state, teachers=data)
+
+    @over_seeds
+    def evaluate(self, hyper: AgentConfig, state: TrainState, key: jax.Array) -> Episode:
+        """Greedy episodes on test goals."""
+        played = play.evaluate(hyper, self._on_test, self._tested, state, key=key)
+        return jax.tree.map(lambda x: x[: self.config.trainer.eval_episodes], devices.whole(played))
+
+    def rows(self, evaluated: Episode) -> list[dict[str, Any]]:
+        """Statistics of the episodes of each seed."""
+        seeds = len(evaluated.success_any)
+        found = [summarise(jax.tree.map(lambda x, i=i: x[i], evaluated)) for i in range(seeds)]
+        return [{name: one[name] for name in _EVALUATED} for one in found]
+
+    def tables(self, hyper: AgentConfig, state: TrainState, seeds: Sequence[int]) -> list[dict[str, Any]]:
+        """The regions of each seed, if it has a Commander."""
+        if not self.config.commander.enabled:
+            return []
+        return figures.region_rows(hyper, state, seeds=seeds, goal=self.goal, episode_length=self.spec.episode_length)
+
+    def figures(self, rows: Sequence[Mapping[str, Any]], tables: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+        """Success with the regions, how these grew, and what SGIM chose."""
+        found = {"summary": figures.summary_figure(regions=tables, rows=rows, walls=self.walls)}
+        if tables:
+            found["growth"] = figures.growth_figure(regions=tables, walls=self.walls)
+        if rows and self.config.sgim.enabled:
+            found["sgim"] = figures.sgim_figure(regions=tables, rows=rows, walls=self.walls)
+        return found
+
+    def facts(self, rows: Sequence[Mapping[str, Any]]) -> Mapping[str, str]:
+        """Regions and edges, SGIM's strategies, and faults of the simulator."""
+        found = {}
+        regions, edges = mean(rows, "abstraction/regions"), mean(rows, "refinement/edges")
+        if regions is not None:
+            found["regions"] = f"{regions:.0f}" + ("" if edges is None else f", {edges:.0f} edges")
+        shares = [key for row in rows[:1] for key in row if key.startswith(_SHARE)]
+        if shares:
+            named = {key.removeprefix(_SHARE): mean(rows, key) for key in shares}
+            found["strategies"] = "  ".join(f"{name} {share:.2f}" for name, share in named.items())
+        if wrong := sum(row.get(key, 0.0) for row in rows for key in _FAULTS):
+            found["simulator faults"] = f"{wrong:.0f}"
+        return found
+
+    def placement(self, state: TrainState, mesh: Mesh | None, whole: TrainState) -> TrainState:
+        """What the learners of levels cut in shares; all else is whole."""
+
+        def of(axis: int) -> Any:
+            return devices.everywhere(mesh) if axis == learners.WHOLE else devices.in_shares(mesh, axis=1 + axis)
+
+        cut = {
+            name: jax.tree.map(of, learners.find(level.learner).shards(getattr(state, name)))
+            for name, level, _ in self.config.learners()
+        }
+        return whole.replace(**cut)
+
+    def scratch(self, seeds: int) -> Mapping[str, int]:
+        """Bytes of rollouts, and of what networks keep of a batch to learn from it."""
+        return memory.scratch(self.config, self.spec, seeds)
+
+
+def resolve(config: Config, engine: str, spec: Spec) -> Config:
+    """`config` with the engine, the map, the initial cuts and the teachers' files that are really used."""
+    values = config.model_dump(mode="json")
+    values["env"]["engine"] = engine
+    for key in ("options", "training"):
+        options = values["env"][key] = normal(values["env"][key])
+        if "map" in options:  # the run must not change with the file
+            options["map"] = arena.load(options["map"])
+    for teacher in values["sgim"]["teachers"]:
+        teacher["sha256"] = teacher["sha256"] or _checksum(teacher["source"])
+    if values["abstraction"]["cuts"] is None and values["abstraction"]["grid"] is None:
+        values["abstraction"]["cuts"] = spec.region_cuts
+    return parse(values)
+
+
+def _checksum(source: str) -> str | None:
+    """That of a teacher's file; None if there is none to read, which is told when its lessons are needed."""
+    try:
+        reading.check_regular(Path(source))
+        return files.sha256(Path(source))
+    except (OSError, ValueError):
+        return None
+
+
+def make_env(config: Config, goals: str, **others: Any) -> Any:
+    """The task of `config`: on its test goals with "test", as for training with "train"; `others` are options too."""
+    if goals == "train":
+        options = {"goals": goals} | config.env.options | config.env.training | others
+    else:
+        options = config.env.options | {"goals": goals} | others
+    try:
+        return envs.make(config.env.name, engine=config.env.engine, **options)
+    except envs.EnvError as error:
+        raise ConfigError(f"env: {error}") from None
+
+
+def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: Any, spec: Spec) -> Demonstrations:
+    """What a teacher shows; raises `UserError` if that is not what it should be."""
+    if teacher.source == "map":
+        demos = teachers.shortest_paths(env)
+    else:
+        demos = teachers.load(Path(teacher.source), env=config.env.name, spec=spec, sha256=teacher.sha256)
+    if teacher.kind == "action" and demos.actions is None:
+        raise ConfigError(f"sgim.teachers: {teacher.source} shows no actions; {teacher.name} cannot be of kind action")
+    if teacher.flaw == "repetitive":
+        return teachers.repetitive(demos)
+    if teacher.flaw == "other_body":
+        return teachers.other_body(demos)
+    if teacher.flaw == "wrong_half":
+        return teachers.wrong_half(demos, spec.goal_point(tested.reset(modes.key(0)).obs))
+    return demos
+
+
+def _a_goal(spec: Spec, env: Any) -> np.ndarray:
+    """A goal that `env` draws, as an abstract point [d]; dimensions that goals leave open are 0."""
+    goal = env.draw_goal(modes.key(0))
+    return np.asarray(spec.goal_point(jax.numpy.concatenate([jax.numpy.zeros(spec.state_dim), goal])))

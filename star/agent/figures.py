@@ -1,0 +1,185 @@
+"""STAR's figures: the regions over the maze, as they are and as they grew, what SGIM chose, success by the goal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from star.abstraction.regions import locate
+from star.agent import commander, values
+from star.agent.decisions import Roadmap
+from star.agent.kind import STAR
+from star.agent.sections import AgentConfig
+from star.agent.state import TrainState
+from star.sgim import selection
+from star.training.figures import draw_measures
+
+_MAX_PANELS = 5
+_GROWTH_PANELS = 4
+
+Row = Mapping[str, Any]
+
+
+def region_rows(
+    config: AgentConfig,
+    state: TrainState,
+    *,
+    seeds: Sequence[int],
+    goal: np.ndarray,
+    episode_length: int,
+) -> list[dict[str, Any]]:
+    """The abstraction of every seed (leading axis of `state`) as plain values, a row of `regions.jsonl` each.
+
+    `lower` and `upper` are the corners of the regions in use, `chosen` how often the Commander chose each of late,
+    `visited` how many of its decisions of late began there (of a learned model only). `value` is the Commander's value
+    of each for `goal` [d], a test goal, `target` the index of the region it would choose there, both as in greedy
+    episodes of `episode_length` env steps. `reaches` and `misses` are pairs of indices: the edges of the graph, and
+    what was shown unreachable. With SGIM there are its `competence` in each region, and `drawn`, the share of its
+    choices that fall there.
+    """
+    tables = _tables(config, jax.numpy.asarray(goal), state, episode_length)
+    verdicts = {"reaches": state.graph.reaches, "misses": state.graph.misses}
+    found, pairs, count = jax.device_get((tables, verdicts, state.abstraction.count))
+
+    def of(table: np.ndarray, index: int) -> list[Any]:
+        values = table[index, : count[index]]
+        return (np.round(values.astype(float), 4) if values.dtype.kind == "f" else values).tolist()
+
+    return [
+        {"goal": np.round(goal.astype(float), 4).tolist()}
+        | {name: of(table, i) for name, table in found.items()}
+        | {name: np.argwhere(table[i, : count[i], : count[i]]).tolist() for name, table in pairs.items()}
+        for i in range(len(seeds))
+    ]
+
+
+@partial(jax.jit, static_argnames="episode_length")
+def _tables(config: AgentConfig, goal: Array, states: TrainState, episode_length: int) -> dict[str, Array]:
+    """What is known of each region of every seed, leading axes [seeds, R]."""
+    return jax.vmap(partial(_table, config, goal, episode_length))(states)
+
+
+def _table(config: AgentConfig, goal: Array, episode_length: int, state: TrainState) -> dict[str, Array]:
+    goal_region = locate(state.abstraction, goal)
+    roadmap = Roadmap.of(config.commander, state.abstraction, state.graph)
+    settled = commander.settle(config.commander, state.commander, roadmap, episode_length=episode_length)
+    value, target = values.towards(settled, roadmap.allowed, goal_region)
+    tables = {
+        "lower": state.abstraction.lower,
+        "upper": state.abstraction.upper,
+        "chosen": state.commander.chosen,
+        "value": value,
+        "target": target,
+    }
+    if state.commander.model is not None:
+        tables["visited"] = (state.commander.model.led.sum(axis=-1) + state.commander.model.lost).sum(axis=(0, 2))
+    if state.sgim is not None:
+        tables["competence"] = selection.competence(state.sgim)
+        tables["drawn"] = selection.probabilities(config.sgim.selection, state.sgim).sum(axis=-1)
+    return tables
+
+
+def summary_figure(*, regions: Sequence[Row], rows: Sequence[Row], walls: np.ndarray) -> Figure:
+    """Draw the last abstraction of each of the first five seeds in `regions`, and the success in `rows`.
+
+    `walls` [n, 4] are rectangles (x_low, y_low, x_high, y_high). Regions are coloured by how often the Commander
+    chose them of late.
+    """
+    last = {row["seed"]: row for row in regions}
+    shown = list(last.values())[:_MAX_PANELS]
+    figure = Figure(figsize=(4.6 * (len(shown) + 1), 4.4), layout="constrained")
+    axes = list(np.atleast_1d(figure.subplots(1, len(shown) + 1)))
+    _draw_panels(axes[:-1], [(row, f"regions, seed {row['seed']}") for row in shown], walls)
+    draw_measures(axes[-1], rows, STAR.measures, unit=STAR.unit)
+    return figure
+
+
+def growth_figure(*, regions: Sequence[Row], walls: np.ndarray, moments: Sequence[float] | None = None) -> Figure:
+    """Draw the abstraction of the first seed in `regions` at `moments` (env steps), by default quarters of the run.
+
+    Each moment shows the first row at or after it, or the last one; no row is shown twice.
+    """
+    rows = [row for row in regions if row["seed"] == regions[0]["seed"]]
+    if moments is None:
+        moments = [rows[-1]["env_steps"] * (i + 1) / _GROWTH_PANELS for i in range(_GROWTH_PANELS)]
+    found = [next((row for row in rows if row["env_steps"] >= moment), rows[-1]) for moment in moments]
+    shown = list({row["env_steps"]: row for row in found}.values())
+    figure = Figure(figsize=(4.6 * len(shown), 4.4), layout="constrained")
+    axes = list(np.atleast_1d(figure.subplots(1, len(shown))))
+    titles = [f"{len(row['chosen'])} regions at {row['env_steps'] / 1e6:.3g} M env steps" for row in shown]
+    _draw_panels(axes, list(zip(shown, titles, strict=True)), walls)
+    return figure
+
+
+def sgim_figure(*, regions: Sequence[Row], rows: Sequence[Row], walls: np.ndarray) -> Figure:
+    """Draw what SGIM chose: the share of every strategy and the competence over time, and the last map of interest.
+
+    Shares are means over seeds; the map is that of the first seed in `regions`.
+    """
+    steps = sorted({row["env_steps"] for row in rows})
+    prefix = "sgim/share_"
+    names = [key.removeprefix(prefix) for key in rows[0] if key.startswith(prefix)]
+
+    def curve(key: str) -> list[float]:
+        return [float(np.mean([row[key] for row in rows if row["env_steps"] == step])) for step in steps]
+
+    last = [row for row in regions if row["seed"] == regions[0]["seed"]][-1] if regions else None
+    figure = Figure(figsize=(10.4 if last else 5.8, 4.4), layout="constrained")
+    axes = figure.subplots(1, 2 if last else 1, squeeze=False)[0]
+    millions = np.asarray(steps) / 1e6
+    axes[0].stackplot(millions, [curve(prefix + name) for name in names], labels=names, alpha=0.7)
+    axes[0].plot(millions, curve("sgim/competence"), "k--", label="competence")
+    axes[0].set(xlabel="million env steps", ylabel="share of episodes", ylim=(0, 1))
+    axes[0].legend(loc="upper left", fontsize="small")
+    if last:
+        draw_regions(axes[1], last, walls, by="drawn")
+        most = max([*last["drawn"], 1e-9])
+        scale = ScalarMappable(norm=Normalize(0, most), cmap="viridis")
+        figure.colorbar(scale, ax=axes[1], label=f"share of choices at {last['env_steps'] / 1e6:.3g} M env steps")
+    return figure
+
+
+def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str = "chosen") -> None:
+    """The first two abstract dimensions of the regions of a row, coloured `by` one of its values, over the walls."""
+    lower, upper, chosen = (np.asarray(row[key], float) for key in ("lower", "upper", by))
+    colours = ScalarMappable(norm=Normalize(0, max(float(chosen.max()), 1e-9)), cmap="viridis").to_rgba(chosen)
+    for low, high, colour in zip(lower, upper, colours, strict=True):
+        width, height = (high - low)[:2]
+        axis.add_patch(Rectangle(low[:2], width, height, facecolor=colour, edgecolor="white", linewidth=1.0))
+    draw_walls(axis, walls)
+    frame(axis, lower, upper)
+
+
+def frame(axis: Axes, lower: np.ndarray, upper: np.ndarray) -> None:
+    """Show x and y of all boxes [N, d], to scale."""
+    axis.set(xlim=(lower[:, 0].min(), upper[:, 0].max()), ylim=(lower[:, 1].min(), upper[:, 1].max()))
+    axis.set(xlabel="x", ylabel="y", aspect="equal")
+
+
+def draw_walls(axis: Axes, walls: np.ndarray) -> None:
+    """Rectangles [n, 4] (x_low, y_low, x_high, y_high)."""
+    for x_low, y_low, x_high, y_high in walls:
+        axis.add_patch(
+            Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, facecolor="0.25", alpha=0.75, linewidth=0)
+        )
+
+
+def _draw_panels(axes: Sequence[Axes], panels: Sequence[tuple[Row, str]], walls: np.ndarray) -> None:
+    """One abstraction for each of `axes`, with its title, and the scale of their colours."""
+    for axis, (row, title) in zip(axes, panels, strict=True):
+        draw_regions(axis, row, walls)
+        axis.set_title(title)
+    if panels:
+        share = ScalarMappable(norm=Normalize(0, 1), cmap="viridis")
+        label = "chosen by the Commander (relative to the most chosen)"
+        axes[0].figure.colorbar(share, ax=list(axes), label=label)

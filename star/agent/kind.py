@@ -1,0 +1,53 @@
+"""STAR as a kind of experiment: its settings, its measures and its own commands. Light: nothing heavy is imported."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+from star.agent.migrations import FORMAT, TO_NEXT
+from star.agent.sections import Config
+from star.config.kinds import Kind, Measure
+
+
+def _lazily(module: str, name: str) -> Callable[..., Any]:
+    """The function `name` of that module of this package, which is imported when it is first called."""
+    return lambda *args, **kwargs: getattr(importlib.import_module(f"star.agent.{module}"), name)(*args, **kwargs)
+
+
+def _episodes(config: Config) -> int:
+    return config.trainer.eval_episodes
+
+
+STAR = Kind(
+    Config=Config,
+    build=_lazily("experiment", "Star"),
+    measures=(
+        Measure("success_final", label="success at the last step", where="on test goals", episodes=_episodes),
+        Measure("success_any", label="success at any step", where="on test goals", episodes=_episodes),
+    ),
+    title=lambda config: config.env.name,
+    unit="env steps",
+    tables="regions",
+    row={"lower": list, "upper": list, "chosen": list},
+    # not known yet; what the environment has repaired
+    may_be_nan=("graph/error", "sgim/mean", "env/non_finite"),
+    levels={
+        "commander": ("commander/reward", None, "commander/td_error"),
+        "tutor": ("tutor/reward", "tutor/actor_loss", "tutor/critic_loss"),
+        "controller": ("controller/reward", "controller/actor_loss", "controller/critic_loss"),
+        "forward model": (None, None, "forward_model/loss"),
+    },
+    format=FORMAT,
+    migrations=TO_NEXT,
+    harmless=("env.engine",),
+    anywhere={"env.engine": "auto"},
+    commands={
+        "evaluate": _lazily("commands", "evaluate"),
+        "render": _lazily("commands", "render"),
+        "record": _lazily("commands", "record"),
+        "envs": _lazily("commands", "envs"),
+        "map": _lazily("growth_map", "growth_map"),
+    },
+)

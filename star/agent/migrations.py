@@ -1,0 +1,26 @@
+"""How checkpoints of older formats become what this version reads: from each format to the next one.
+
+Whoever changes what is saved adds one to `FORMAT`, a row to `TO_NEXT` and, under `tests/data`, a run of the old format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from star.config.kinds import Arrays, Migration
+
+FORMAT = 4  # since aiming at a goal is counted apart from aiming at its region
+
+
+def _count_for_both_aims(arrays: Arrays) -> Arrays:
+    """The Commander's counts [seeds, ...] for either aim [seeds, 2, ...]: nobody knows any more which it was."""
+    counts = ("commander/model/led", "commander/model/lost")
+    return {name: np.stack([x, x], axis=1) if name in counts else x for name, x in arrays.items()}
+
+
+TO_NEXT: Mapping[int, Migration] = {
+    2: Migration(),  # the same, in other files and without checksums
+    3: Migration(arrays=_count_for_both_aims),
+}

@@ -1,0 +1,106 @@
+"""The words of a command line: numbers, settings with dots, and places for what is written."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from envs.common import files, reading
+from envs.common.errors import UserError
+from star.config.section import ConfigError
+
+
+def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """Take the dotted settings `--section.key VALUE` or `--section.key=VALUE` out of `arguments`.
+
+    Returns the other words, and the settings; raises `UserError` for a setting without a value.
+    """
+    words: list[str] = []
+    found: dict[str, Any] = {}
+    waiting = list(arguments)
+    while waiting:
+        word = waiting.pop(0)
+        name, equals, text = word.removeprefix("--").partition("=")
+        if not word.startswith("--") or "." not in name:
+            words.append(word)
+            continue
+        if not equals:
+            if not waiting or waiting[0].startswith("--"):
+                raise ConfigError(f"{word}: needs a value")
+            text = waiting.pop(0)
+        found[name] = value(text)
+    return words, found
+
+
+def value(text: str) -> Any:
+    """Numbers, lists and the like as YAML reads them; what is no more than text stays as it was typed."""
+    try:
+        read = reading.plain(text)
+    except yaml.YAMLError:
+        return text
+    return text if isinstance(read, str) and "\n" in text else read  # YAML would fold the lines of a map
+
+
+def new_place(folder: Path, name: str) -> Path:
+    """A new place in `folder`, named after the time. It is made at once, so that no other command takes it."""
+    first = folder / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    places = itertools.chain([first], (first.with_name(f"{first.name}-{number}") for number in itertools.count(2)))
+    for place in places:
+        try:
+            files.check_name(place)
+            place.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ConfigError(f"{place}: cannot be written: {error.strerror}") from None
+        return place
+    raise AssertionError
+
+
+@contextmanager
+def given_back(place: Path) -> Iterator[None]:
+    """If what is done here is refused, remove the new `place` for it, and the folder around, as far as empty."""
+    try:
+        yield
+    except UserError:
+        with suppress(OSError):
+            place.rmdir()
+            place.parent.rmdir()
+        raise
+
+
+def natural(text: str) -> int:
+    """A whole number from 0 on."""
+    if not text.isdecimal() or int(text) >= 2**31:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to 2^31 - 1")
+    return int(text)
+
+
+def count(most: int = 2**31 - 1) -> Callable[[str], int]:
+    """Reads a whole number from 1 to `most`."""
+
+    def read(text: str) -> int:
+        if not text.isdecimal() or not 1 <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {most}")
+        return int(text)
+
+    return read
+
+
+def typed(path: Path) -> str:
+    """A path as one types it in a shell."""
+    return shlex.quote(str(path))
+
+
+def refuse_settings(overrides: dict[str, Any]) -> None:
+    """Raise `UserError` for settings that a command does not take."""
+    for key in overrides:
+        raise ConfigError(f"--{key}: this command takes no settings")

@@ -1,0 +1,230 @@
+"""YAML files, run folders and dotted overrides become the config of an experiment; what is wrong becomes one line."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from envs.common import reading
+from envs.common.errors import UserError, shown
+from envs.common.files import nearest_file
+from envs.common.plainly import plain
+from star.config import kinds
+from star.config.run import RunConfig
+from star.config.section import ConfigError, Section
+
+DEFAULT = "star"
+"""The experiment of a config that names none."""
+
+
+def load(path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers: Sequence[str | Path] = ()) -> Any:
+    """Read a YAML file, lay others over it, apply dotted overrides such as `{"tutor.period": 5}` and validate.
+
+    The result is a `Config` of the kind that its `experiment` names.
+
+    Raises:
+      UserError: with one line that names the key, the value and what is allowed.
+
+    """
+    values: dict[str, Any] = {}
+    for file in (path, *layers):
+        values = _merged(values, read_file(Path(file)))
+    return parse(values, overrides, source=" with ".join(map(str, (path, *layers))))
+
+
+def experiment_of(run_dir: Path) -> str:
+    """The name of the experiment of a run; raises `UserError` if the folder is none of a run."""
+    return read_file(_config_file(run_dir)).get("experiment", DEFAULT)
+
+
+def load_run(run_dir: Path, overrides: Mapping[str, Any]) -> Any:
+    """The settings of a run, with others in their place; raises `UserError`."""
+    return load(_config_file(run_dir), overrides)
+
+
+def load_to_act(run_dir: Path, overrides: Mapping[str, Any]) -> Any:
+    """Those of a run whose agents act on this machine, whatever they were trained on; raises `UserError`."""
+    anywhere = kinds.find(experiment_of(run_dir)).anywhere
+    return load_run(run_dir, {"trainer.devices": 1} | dict(anywhere) | dict(overrides))
+
+
+def _config_file(run_dir: Path) -> Path:
+    path = run_dir / "config.yaml"
+    try:
+        if not run_dir.exists():
+            raise ConfigError(f"{run_dir}: is not a run directory, there is nothing of this name")
+        if not path.is_file():
+            raise ConfigError(f"{run_dir}: is not a run directory, it holds no config.yaml")
+    except OSError as error:
+        raise ConfigError(f"{run_dir}: cannot be read: {error.strerror}") from None
+    return path
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """`below` with what `above` says in its place, section by section; another task brings options of its own."""
+    another = "name" in above and above["name"] != below.get("name")
+    merged = {key: old for key, old in below.items() if not (another and key in ("options", "training"))}
+    for key, value in above.items():
+        old = merged.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            merged[key] = _merged(old, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def read_file(path: Path) -> dict[str, Any]:
+    """What a YAML file with sections holds; raises `UserError`."""
+    try:
+        values = reading.plain(reading.text(path))
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file{nearest_file(path, ('.yaml', '.yml'))}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" line {mark.line + 1} column {mark.column + 1}:" if mark else ""
+        raise ConfigError(f"{path}:{where} not valid YAML: {reading.problem(error)}") from None
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: should hold sections such as `trainer:`, not {shown(values)}")
+    return values
+
+
+def parse(
+    values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, *, source: str = "configuration"
+) -> Any:
+    """Validate nested `values` after applying dotted `overrides`; raises `UserError`. As in `load`."""
+    nested = _with_overrides(plain(values), plain(overrides or {}))
+    try:
+        model = kinds.find(nested.get("experiment", DEFAULT)).Config
+    except UserError as error:
+        raise ConfigError(f"{source}: {error}") from None
+    try:
+        return model.model_validate(nested)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {explain(error.errors()[0], model)}") from None
+
+
+def check_setting(config: RunConfig, key: str, value: Any, *, source: str) -> None:
+    """Raise `UserError` if there is no setting `key`, or `value` is none of its values whatever the others are."""
+    try:
+        type(config).model_validate(_with_overrides(config.model_dump(mode="json"), {key: value}))
+    except ValidationError as error:
+        for each in error.errors():
+            if each["type"] == "extra_forbidden" or ".".join(map(str, each["loc"])).startswith(key):
+                raise ConfigError(f"{source}: {explain(each, type(config))}") from None
+
+
+def type_of(key: str, model: type[RunConfig]) -> Any:
+    """The type of the setting `key` of a `model`, or None if there is none or it is an option of the task."""
+    annotation: Any = model
+    for part in key.split("."):
+        known = getattr(annotation, "model_fields", {})
+        if part not in known:
+            return None
+        annotation = known[part].annotation
+    return annotation
+
+
+def fields(section: type[Section], prefix: str = "") -> Iterator[tuple[str, Any, str]]:
+    """All settings as (dotted key, default, description)."""
+    for name, field in section.model_fields.items():
+        annotation = field.annotation
+        if isinstance(annotation, type) and issubclass(annotation, Section) and annotation.model_fields:
+            yield from fields(annotation, f"{prefix}{name}.")
+        else:
+            default = {} if isinstance(field.default, Section) else field.default
+            yield f"{prefix}{name}", default, field.description or ""
+
+
+def dotted(config: RunConfig) -> dict[str, Any]:
+    """The settings of `config` by their dotted keys, as overrides have them; task options have keys of their own."""
+    return _flat(config.model_dump(mode="json"))
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found
+
+
+def changed(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """What `after` has, by its dotted keys, and `before` has not or not so."""
+    return {key: value for key, value in after.items() if key not in before or before[key] != value}
+
+
+def _with_overrides(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
+    nested = {key: dict(value) if isinstance(value, Mapping) else value for key, value in values.items()}
+    for key, value in overrides.items():
+        *parents, last = key.split(".")
+        level = nested
+        for parent in parents:
+            child = level.get(parent)
+            level[parent] = dict(child) if isinstance(child, Mapping) else {}
+            level = level[parent]
+        level[last] = value
+    return nested
+
+
+_PLAIN = {
+    "a valid tuple": "a list such as [a, b]",
+    r"a valid dictionary( or instance of \w+)?": "a mapping such as {key: value}",
+    "a valid boolean(, unable to interpret input)?": "true or false",
+    "False, True": "false, true",
+}  # pydantic's words (regular expressions), and what users of YAML say
+
+
+def explain(error: ErrorDetails, model: type[BaseModel]) -> str:
+    """One pydantic error of `model` as one line: key, value, what is allowed."""
+    path = [part if len(part) <= 60 else f"{part[:57]}..." for part in map(str, error["loc"])]
+    key = ".".join(path)
+    if error["type"] == "extra_forbidden":
+        return f"{key}: unknown key{_nearest_key(path, model)}"
+    message = error["msg"].removeprefix("Value error, ").replace("Input should be", "should be")
+    for words, ours in _PLAIN.items():
+        message = re.sub(words, ours, message)
+    message = message[:1].lower() + message[1:]
+    if error["type"] == "value_error" and not isinstance(error["input"], str | int | float | bool):
+        return f"{key}: {message}" if key else message
+    return f"{key}: {shown(error['input'])} is not allowed: {message}" if key else message
+
+
+def _nearest_key(path: Sequence[str], model: type[BaseModel]) -> str:
+    """` (did you mean ...?)` with the most similar valid key, looked for in the section and then everywhere."""
+    section: Any = model
+    for part in path[:-1]:
+        if hasattr(section, "model_fields"):
+            section = section.model_fields[part].annotation
+        else:  # a list or a mapping of sections: next comes an index or a name
+            section = get_args(section)[-1] if not part.isdigit() else get_args(section)[0]
+    matches = difflib.get_close_matches(path[-1], section.model_fields, n=1, cutoff=0.5)
+    if matches:
+        return f" (did you mean {'.'.join([*path[:-1], matches[0]])}?)"
+    if issubclass(model, RunConfig):
+        everywhere = {key.rsplit(".", 1)[-1]: key for key, _, _ in fields(model)}
+        matches = difflib.get_close_matches(path[-1], everywhere, n=1, cutoff=0.8)
+        if matches:
+            return f" (did you mean {everywhere[matches[0]]}?)"
+        for name in kinds.OURS:
+            if model is not (other := kinds.find(name).Config) and _has(other, path):
+                return f", it is one of experiment {name} (allowed: {', '.join(section.model_fields)})"
+    return f" (allowed: {', '.join(section.model_fields)})"
+
+
+def _has(model: Any, path: Sequence[str]) -> bool:
+    """Whether `path` leads to a setting or a section of `model`."""
+    for part in path:
+        if part not in getattr(model, "model_fields", {}):
+            return False
+        model = model.model_fields[part].annotation
+    return True

@@ -1,0 +1,1 @@
+"""Statistics and pictures of runs, and the page that shows them."""

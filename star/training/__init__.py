@@ -1,0 +1,1 @@
+"""Runs: folder, journal, checkpoints, signals and the loop around the epochs of an experiment."""

@@ -1,0 +1,104 @@
+"""What learns, as training sees it: pure functions over the states of several seeds, and what people see of them.
+
+    class Bandit(Experiment):                    # in a file of the user's own
+        steps_per_epoch = 100
+
+        @over_seeds
+        def init(self, hyper, key): ...          # a state with `epoch`, for one seed
+
+        @over_seeds
+        def epoch(self, hyper, data, state): ... # the next state and scalars
+
+        @over_seeds
+        def evaluate(self, hyper, state, key): ...
+
+        def rows(self, evaluated): ...           # on the host: a mapping of numbers for each seed
+
+Training jits `init`, `epoch` and `evaluate`, and asks for the rest on the host.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial, wraps
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from star.training.figures import measures_figure
+
+Row = Mapping[str, Any]
+PARTS = ("steps_per_epoch", "init", "epoch", "evaluate", "rows")
+"""What every experiment must have; all else has a default."""
+
+
+def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A method for one seed, for all of them: its arguments have a leading axis of seeds, `data` has none.
+
+    The floats of `hyper` are scalars, or have that axis too.
+    """
+    _, _, *names = inspect.signature(function).parameters
+
+    @wraps(function)
+    def lifted(self: Any, hyper: Any, *args: Any) -> Any:
+        axes = [None if name == "data" else 0 for name in names]
+        return jax.vmap(partial(function, self), in_axes=(_axis(hyper), *axes))(hyper, *args)
+
+    return lifted
+
+
+def _axis(hyper: Any) -> int | None:
+    """The axis of `hyper` under a vmap over seeds: none if its floats are scalars."""
+    leaves = jax.tree.leaves(hyper)
+    return 0 if leaves and np.ndim(leaves[0]) else None
+
+
+class Experiment:
+    """What learns. Subclasses have at least the `PARTS`; states are pytrees with leading axes [S] of seeds."""
+
+    steps_per_epoch: int
+    """Env steps, or iterations, of one seed in one epoch."""
+    init: Callable[..., Any]
+    """(hyper, keys [S]) -> states; they hold `epoch` [S], whole numbers from 0 on."""
+    epoch: Callable[..., Any]
+    """(hyper, data, states) -> (states, scalars [S] by their names); the states given are used up."""
+    evaluate: Callable[..., Any]
+    """(hyper, states, keys [S]) -> what `rows` takes."""
+    rows: Callable[..., list[dict[str, Any]]]
+    """What was evaluated, on the host -> for each seed its measures and other numbers by their names."""
+
+    def __init__(self, config: Any) -> None:
+        """Make the experiment of `config`; raises `UserError` if that is not possible on this machine."""
+        self.config = config
+        """The settings, with what this machine makes of them."""
+
+    def resolve(self, config: Any) -> Any:
+        """Other settings of this structure, with what this machine makes of them."""
+        return config
+
+    def data(self) -> Any:
+        """What an epoch reads besides the state; raises `UserError` before anything is written."""
+        return ()
+
+    def tables(self, hyper: Any, state: Any, seeds: Sequence[int]) -> list[dict[str, Any]]:
+        """Rows to write down at an evaluation besides metrics, one a seed, or none."""
+        return []
+
+    def figures(self, rows: Sequence[Row], tables: Sequence[Row]) -> Mapping[str, Any]:
+        """Matplotlib figures by their names, from all rows of metrics and of `tables`."""
+        return {"summary": measures_figure(rows, self.config)}
+
+    def facts(self, rows: Sequence[Row]) -> Mapping[str, str]:
+        """What the console says of the latest epoch, besides measures."""
+        return {}
+
+    def placement(self, state: Any, mesh: Mesh | None, whole: Any) -> Any:
+        """Where the leaves of `state` (shapes) lie between epochs; `whole` is each of them whole on every device."""
+        return whole
+
+    def scratch(self, seeds: int) -> Mapping[str, int]:
+        """Bytes of what comes and goes in an epoch, by the names of settings that make it large."""
+        return {}

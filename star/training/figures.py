@@ -1,0 +1,63 @@
+"""Figures of what evaluations measure, and how figures are written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from star.config import kinds
+from star.config.kinds import Measure
+from star.config.run import RunConfig
+
+Row = Mapping[str, Any]
+
+_STYLES = ("-", "--", ":", "-.")
+
+
+def measures_figure(rows: Sequence[Row], config: RunConfig) -> Figure:
+    """Draw what was measured in `rows`."""
+    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    kind = kinds.of(config)
+    draw_measures(figure.subplots(), rows, kind.measures, unit=kind.unit)
+    return figure
+
+
+def draw_measures(axis: Axes, rows: Sequence[Row], measures: Sequence[Measure], *, unit: str) -> None:
+    """The measures over env steps, means over seeds, with the range between seeds."""
+    for measure, style in zip(measures, _STYLES * len(measures), strict=False):
+        evaluated = [row for row in rows if row.get(measure.key) is not None]
+        steps = sorted({row["env_steps"] for row in evaluated})
+        curves = [[row[measure.key] for row in evaluated if row["env_steps"] == step] for step in steps]
+        if not curves:
+            continue
+        label = literal(measure.name.replace("_", " "))
+        (line,) = axis.plot(steps, [np.mean(c) for c in curves], style, marker=".", label=label)
+        low, high = [np.min(c) for c in curves], [np.max(c) for c in curves]
+        axis.fill_between(steps, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+    axis.set_xlabel(unit)
+    axis.set_ylabel(f"evaluation {measures[0].where}".rstrip())
+    if all(measure.episodes for measure in measures):
+        axis.set_ylim(-0.02, 1.02)
+    axis.grid(alpha=0.3)
+    if axis.lines:  # none before the first evaluation
+        axis.legend(loc="lower right")
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure, and the folder it is to be in."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
+
+
+def literal(text: str) -> str:
+    """What a user typed, for a figure.
+
+    Matplotlib would set what is between two $ as a formula, or fail to, and leave a name that begins with _ out of
+    legends.
+    """
+    return " " * text.startswith("_") + text.replace("$", r"\$")

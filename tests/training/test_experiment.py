@@ -1,0 +1,200 @@
+"""An experiment in a file outside the package, the bandit of docs/experiments.md: all commands work on it."""
+
+import csv
+import json
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from star.cli import main
+from star.config import kinds
+from star.config.kinds import Measure
+from star.config.loading import parse
+from star.sweeps import work as working
+from star.training.checkpoint import Checkpoints, opened
+from star.training.journal import JsonLines
+
+PAGE = Path(__file__).parents[2] / "docs" / "experiments.md"
+# The same with a measure where less is better, and seeds that share a counter.
+CLOSER = """
+from bandit import *
+
+CLOSER = KIND._replace(measures=KIND.measures[::-1], in_step=True)
+PARTS = KIND._replace(build=lambda config: Parts(config))
+NOTHING = KIND._replace(measures=())
+OTHER = KIND._replace(Config=Learning)
+
+
+class Parts(Experiment):
+    steps_per_epoch, init, rows = 1, None, None
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty folder with the page's files, which are trusted."""
+    text = PAGE.read_text(encoding="utf-8")
+    for name in ("bandit.py", "run.yaml"):
+        block = re.search(rf'```\w+ title="{name}"\n(.*?)```', text, re.DOTALL).group(1)
+        (tmp_path / name).write_text(block)
+    (tmp_path / "closer.py").write_text(CLOSER)
+    (tmp_path / "closer.yaml").write_text((tmp_path / "run.yaml").read_text().replace("bandit:KIND", "closer:CLOSER"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setenv("STAR_IMPORT", "bandit,closer")
+    for name in ("bandit", "closer"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    yield tmp_path
+    for name in ("bandit", "closer"):
+        sys.modules.pop(name, None)
+
+
+def trained(run, *words, config="run.yaml"):
+    assert main(["train", config, "--run-dir", run, "--quiet", *words]) == 0
+    return Path(run)
+
+
+def arrays(run, step):
+    with opened(Path(run)) as checkpoints:
+        return checkpoints.arrays(step)
+
+
+def test_it_trains_and_goes_on_bit_for_bit(here):
+    whole = trained("whole", "--trainer.checkpoint_every", "1", "--trainer.sinks", "[tensorboard]")
+    assert {"config.yaml", "metrics.jsonl", "provenance.jsonl", "checkpoints", "figures", "seed_4"} <= {
+        entry.name for entry in whole.iterdir()
+    }
+    assert any(entry.name.startswith("events.out.tfevents") for entry in whole.iterdir())
+    rows = JsonLines(whole / "metrics.jsonl").read()
+    assert len(rows) == 20 * 5 and {"bandit/error", "values/non_finite"} <= rows[0].keys()
+    assert rows[-1]["eval/pay"] == pytest.approx(0.8)
+    parts = trained("parts", "--total-env-steps", "200")
+    shutil.rmtree(parts / "figures")  # as of a run that was killed: it goes on from its last checkpoint
+    with (parts / "metrics.jsonl").open("a") as file:
+        file.write('{"seed": 0, "env_')
+    assert main(["train", "--resume", "parts", "--total-env-steps", "400", "--quiet"]) == 0
+    found, expected = arrays("parts", 400), arrays("whole", 400)
+    assert found.keys() == expected.keys() == {"values", "epoch", "key"} and expected["values"].all()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+
+
+def test_the_other_commands_work_on_it(here, capsys):
+    trained("run")
+    capsys.readouterr()
+    assert main(["evaluate", "run", "--checkpoint", "all", "--json"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [row["env_steps"] for row in rows] == Checkpoints(Path("run")).steps()
+    pays = [seed["pay"] for seed in rows[-1]["seeds"]]
+    assert rows[-1]["pay"] == pytest.approx(np.mean(pays)) and len(pays) == 5
+    assert main(["evaluate", "run"]) == 0 and "distance" in capsys.readouterr().out
+    assert main(["report", "run", "--out", "report.html"]) == 0
+    page = Path("report.html").read_text()
+    assert '"unit":"pulls"' in page and '"key":"eval/pay"' in page and "bandit/error" in page
+    assert main(["settings", "--experiment", "bandit:KIND", "learning"]) == 0
+    assert "share of an error that is learnt (default 0.1)" in capsys.readouterr().out
+
+
+def test_floats_are_tried_side_by_side_and_whole_numbers_apart(here, monkeypatch):
+    made = []
+
+    class Noted(working.SideBySide):
+        def __init__(self, config, slots):
+            made.append((config.learning.pulls, slots))
+            super().__init__(config, slots)
+
+    monkeypatch.setattr(working.work, "__kwdefaults__", working.work.__kwdefaults__ | {"make": Noted})
+    values = {"learning.step_size": [0.01, 0.1, 0.5], "learning.pulls": [10, 20]}
+    Path("sweep.yaml").write_text(yaml.safe_dump({"config": "run.yaml", "parameters": values, "sampler": "grid"}))
+    assert main(["sweep", "sweep.yaml", "--out", "out", "--quiet"]) == 0
+    assert sorted(made) == [(10, 3), (20, 3)]
+    with open("out/trials.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6 and all(row["state"] == "complete" for row in rows)
+    alone = trained("alone", "--learning.step_size", "0.5", "--learning.pulls", "10")
+    (same,) = [row for row in rows if (row["learning.step_size"], row["learning.pulls"]) == ("0.5", "10")]
+    last = [row for row in JsonLines(alone / "metrics.jsonl").read() if row["env_steps"] == 400]
+    assert float(same["distance"]) == pytest.approx(np.mean([row["eval/distance"] for row in last]), rel=1e-5)
+
+
+def test_where_less_is_better_the_least_is_the_best(here, capsys):
+    """And where seeds share a counter, no trial begins among others that have begun."""
+    trained("run", "--trainer.checkpoint_every", "1", "--trainer.eval_every", "1", config="closer.yaml")
+    assert "eval/distance" in JsonLines(Path("run/metrics.jsonl")).read()[0]
+    noted = {
+        int(path.parent.name): json.loads(path.read_text())["distance"]
+        for path in Path("run/checkpoints").glob("*/about.json")
+    }
+    assert Checkpoints(Path("run")).best() == min(noted, key=lambda step: (noted[step], -step))
+    every = JsonLines(Path("run/metrics.jsonl")).read()
+    least = min(np.mean([row["eval/distance"] for row in every if row["env_steps"] == n]) for n in range(20, 401, 20))
+    assert min(noted.values()) == pytest.approx(least)  # the best of all was kept
+    values = {"learning.step_size": [0.01, 0.1, 0.5]}
+    sweep = {"config": "closer.yaml", "parameters": values, "sampler": "grid", "batch": 2}
+    Path("sweep.yaml").write_text(yaml.safe_dump(sweep))
+    assert main(["sweep", "sweep.yaml", "--out", "out", "--quiet"]) == 0
+    with open("out/trials.csv", newline="") as file:
+        found = [float(row["value"]) for row in csv.DictReader(file)]
+    assert len(found) == 3 and found == sorted(found)
+    best = yaml.safe_load(Path("out/best.yaml").read_text())
+    assert f"best:    trial {[0.01, 0.1, 0.5].index(best['learning']['step_size'])}" in capsys.readouterr().out
+    assert main(["report", "run", "--out", "report.html"]) == 0
+    assert Path("report.html").read_text().index('"key":"eval/distance"') > 0
+
+
+@pytest.mark.parametrize("better", ["high", "low"])
+def test_what_was_not_measured_is_worst(better):
+    measure = Measure("x", better=better)
+    assert max((0.5, None, float("nan"), -3.0), key=measure.rank) == (0.5 if better == "high" else -3.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--learning.step_size", "2"], "learning.step_size: 2 is not allowed: should be less than or equal to 1"),
+        (["--learning.stepsize", "1"], "learning.stepsize: unknown key (did you mean learning.step_size?)"),
+        (["--tutor.period", "3"], "tutor: unknown key, it is one of experiment star (allowed: experiment, learning, "),
+        (["--experiment", "sta"], "experiment: 'sta' is not allowed: should be star or module:name (did you mean star"),
+        (["--experiment", "bandit:Bandit"], "experiment: bandit:Bandit: is a class; allowed: a star.config.kinds.Kind"),
+        (["--experiment", "bandit:ARMS"], "experiment: bandit:ARMS: bandit holds no ARMS; allowed: a star.config.kin"),
+        (["--experiment", "closer:PARTS"], "experiment: closer:PARTS: has no epoch; all have steps_per_epoch, init, "),
+        (["--experiment", "closer:NOTHING"], "experiment: closer:NOTHING: measures is (); allowed: one star.config."),
+        (["--experiment", "closer:OTHER"], "allowed: a subclass of star.config.run.RunConfig"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(here, capsys, words, line):
+    assert main(["train", "run.yaml", "--run-dir", "run", "--quiet", *words]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert line in said and not Path("run").exists()
+
+
+def test_a_run_is_of_one_experiment(here, capsys):
+    trained("run")
+    capsys.readouterr()
+    assert main(["train", "--resume", "run", "--experiment", "closer:CLOSER", "--quiet"]) == 2
+    assert "its checkpoint was made with experiment bandit:KIND, not closer:CLOSER" in capsys.readouterr().err
+    for words, told in (
+        (["render", "--run", "run", "--out", "a.png"], "run: its experiment draws no episodes"),
+        (["record", "run", "--out", "a.npz"], "run: its experiment makes no demonstrations"),
+        (["evaluate", "run", "--goals", "grid"], "--goals: experiment bandit:KIND has no such evaluation"),
+    ):
+        assert main(words) == 2
+        (said,) = capsys.readouterr().err.splitlines()
+        assert told in said
+
+
+def test_a_file_alone_imports_nothing(here, capsys, monkeypatch):
+    monkeypatch.setenv("STAR_IMPORT", "")
+    assert main(["train", "run.yaml", "--run-dir", "run", "--quiet"]) == 2
+    assert "only a file names it, so it is not imported; type --import bandit" in capsys.readouterr().err
+    assert "bandit" not in sys.modules and not Path("run").exists()
+    assert main(["train", "run.yaml", "--run-dir", "run", "--quiet", "--import", "bandit"]) == 0
+
+
+def test_star_is_one_of_them():
+    assert kinds.of(parse({})) is kinds.find("star") and parse({}).experiment == "star"
