@@ -111,6 +111,27 @@ def test_what_runs_an_experiment_knows_neither_agents_nor_tasks():
             assert not rooms & {"star.agent", "star.sgim", "star.abstraction", "star.learners", "envs"}, module
 
 
+def test_a_run_begins_without_what_only_figures_and_intervals_need():
+    """Matplotlib and scipy.stats are a third of what it takes to import the trainer."""
+    seen, left, others = set(), ["star.training.trainer", "star.agent.experiment"], set()
+    while left:
+        module = left.pop()
+        if module in seen:
+            continue
+        seen.add(module)
+        for node in parsed(MODULES[module]).body:
+            if isinstance(node, ast.Import):
+                names = {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                names = {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+            else:
+                continue
+            left.extend(names & MODULES.keys())
+            others |= names - MODULES.keys()
+    assert {"star.training.loop", "star.training.figures", "star.report.statistics"} <= seen and "jax" in others
+    assert not [one for one in others if one.split(".")[0] == "matplotlib" or one.startswith("scipy.stats")]
+
+
 def test_only_learners_know_which_learners_there_are():
     for path in sources("star"):
         if path.is_relative_to(ROOT / "star/learners"):

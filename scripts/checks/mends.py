@@ -62,14 +62,14 @@ MENDS = (
     ),
     Mend(
         "intervals over seeds are too narrow",
-        "tests/test_evaluation.py::test_of_normal_seeds_intervals_hold_the_truth_as_often_as_they_say",
+        "tests/report/test_statistics.py::test_of_normal_seeds_intervals_hold_the_truth_as_often_as_they_say",
         "star/report/statistics.py",
         "stats.t.ppf(0.975, np.maximum(freedom, 1.0)) * np.sqrt(variance)",
         "1.96 * np.sqrt(variance)",
     ),
     Mend(
         "seeds that agree give an interval of width 0",
-        "tests/test_evaluation.py::test_seeds_that_agree_leave_open_what_their_episodes_leave_open",
+        "tests/report/test_statistics.py::test_seeds_that_agree_leave_open_what_their_episodes_leave_open",
         "star/report/statistics.py",
         "return np.maximum(spread, share * (1 - share) / (n * episodes))",
         "return spread",

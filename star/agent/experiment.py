@@ -16,7 +16,7 @@ from envs.common import files, modes, reading
 from envs.options import normal
 from envs.vector import VectorEnv
 from star import devices, learners
-from star.agent import checks, figures, levels, memory, play
+from star.agent import checks, levels, memory, play, region_rows
 from star.agent import epoch as learning
 from star.agent.episodes import summarise
 from star.agent.play import Episode
@@ -99,10 +99,12 @@ class Star(Experiment):
         """The regions of each seed, if it has a Commander."""
         if not self.config.commander.enabled:
             return []
-        return figures.region_rows(hyper, state, seeds=seeds, goal=self.goal, episode_length=self.spec.episode_length)
+        return region_rows.of(hyper, state, seeds=seeds, goal=self.goal, episode_length=self.spec.episode_length)
 
     def figures(self, rows: Sequence[Mapping[str, Any]], tables: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
         """Success with the regions, how these grew, and what SGIM chose."""
+        from star.agent import figures  # Matplotlib is slow to import: a run need not wait for it to begin
+
         found = {"summary": figures.summary_figure(regions=tables, rows=rows, walls=self.walls)}
         if tables:
             found["growth"] = figures.growth_figure(regions=tables, walls=self.walls)

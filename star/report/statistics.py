@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from scipy import stats
+import scipy
 
 TAUS = np.linspace(0.0, 1.0, 101)  # where performance profiles are taken
 ABOVE = 0.9  # seeds that succeed more often than this have learnt the task
@@ -89,7 +89,7 @@ def _student(middle: Any, terms: Sequence[tuple[Any, int]]) -> tuple[Any, Any]:
     """
     variance = sum(term for term, _ in terms)
     freedom = variance**2 / np.maximum(sum(term**2 / df for term, df in terms), np.finfo(float).tiny)
-    half = stats.t.ppf(0.975, np.maximum(freedom, 1.0)) * np.sqrt(variance)
+    half = scipy.stats.t.ppf(0.975, np.maximum(freedom, 1.0)) * np.sqrt(variance)
     return middle - half, middle + half
 
 
@@ -99,7 +99,7 @@ def exact_interval(successes: int, trials: int) -> list[float]:
 
 
 def _proportion(successes: int, trials: int, method: Literal["wilson", "exact"]) -> list[float]:
-    interval = stats.binomtest(int(successes), trials).proportion_ci(0.95, method=method)
+    interval = scipy.stats.binomtest(int(successes), trials).proportion_ci(0.95, method=method)
     return [float(interval.low), float(interval.high)]
 
 
@@ -114,7 +114,7 @@ def mean_interval(values: np.ndarray) -> list[float]:
     mean = float(values.mean())
     if len(values) < 2:
         return [mean, mean]
-    half = float(stats.t.ppf(0.975, len(values) - 1) * stats.sem(values))
+    half = float(scipy.stats.t.ppf(0.975, len(values) - 1) * scipy.stats.sem(values))
     return [mean - half, mean + half]
 
 
@@ -140,7 +140,7 @@ def stratified(samples: Sequence[Sequence[float]], statistic: Callable[..., Any]
         return statistic(*(new.get(i, old) for i, old in enumerate(data)))
 
     of_draws = statistic if len(varying) == len(data) else redrawn
-    found = stats.bootstrap(
+    found = scipy.stats.bootstrap(
         [data[i] for i in varying], of_draws, method="percentile", vectorized=False, rng=0, n_resamples=4999
     )
     return middle, found.confidence_interval.low, found.confidence_interval.high

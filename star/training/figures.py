@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from star.config import kinds
 from star.config.kinds import Measure
 from star.config.run import RunConfig
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 Row = Mapping[str, Any]
 
@@ -21,6 +23,8 @@ _STYLES = ("-", "--", ":", "-.")
 
 def measures_figure(rows: Sequence[Row], config: RunConfig) -> Figure:
     """Draw what was measured in `rows`."""
+    from matplotlib.figure import Figure  # slow to import: a run need not wait for it to begin
+
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     kind = kinds.of(config)
     draw_measures(figure.subplots(), rows, kind.measures, unit=kind.unit)

@@ -13,7 +13,7 @@ from star import cli, devices
 from star.config.loading import parse
 from tests.small import RUN
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 REPLAY = """
 import jax, jax.numpy as jnp, numpy as np

@@ -41,7 +41,7 @@ from star.sweeps.work import open_ledger, work
 from star.training import program as programs
 from tests.small import EPOCH, RUN
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

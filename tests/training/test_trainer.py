@@ -37,7 +37,7 @@ from star.training.lock import locked
 from star.training.side_by_side import SideBySide
 from tests.small import EPOCH, RUN, unpacked
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 TIMES = ("wall_s", "env_steps_per_s")
 TINY = RUN | {
     "sgim": {

@@ -328,4 +328,4 @@ built = program.build(parse(RUN))
 state = jax.eval_shape(built.init, built.seed_keys())
 jax.eval_shape(built.epoch, state)
 """
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])

@@ -21,7 +21,7 @@ from star.agent.exams import Exam, Target
 from star.agent.films import Moments, Show
 from star.config.loading import load, parse
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 EPISODE = 40
 
 

@@ -17,7 +17,7 @@ from star.cli.words import split_settings
 from star.config.loading import fields
 from star.training import trainer
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)

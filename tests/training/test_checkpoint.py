@@ -23,7 +23,7 @@ from star.training import checkpoint
 from star.training.checkpoint import Checkpoints, Damaged, best, choose, kept, newest
 from tests.small import unpacked
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def state(number):
