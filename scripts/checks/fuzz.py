@@ -149,12 +149,12 @@ def _work(program: programs.Program) -> int:
     config, agent = program.config.trainer, program.hyper
     steps = (config.num_envs + config.eval_episodes) * program.experiment.spec.episode_length
     updates = agent.forward_model.updates_per_epoch * agent.forward_model.batch_size
-    for _, level, decisions in program.config.learners():
+    for _, level, rollout in program.config.learners():
         rollouts = program.experiment.spec.episode_length // agent.tutor.period
         if level.learner == "td3":
             updates += rollouts * level.td3.updates_per_rollout * level.td3.batch_size
         else:
-            updates += rollouts * level.ppo.passes * decisions * config.num_envs
+            updates += rollouts * level.ppo.passes * rollout.size
     widest = max(_widths(program.config.model_dump()), default=0)
     return config.num_seeds * (steps + updates) * max(widest // 128, 1)
 

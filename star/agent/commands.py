@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -57,7 +56,7 @@ def _split_task(overrides: dict[str, Any]) -> tuple[dict[str, Any], dict[str, An
     return task, {k: v for k, v in overrides.items() if k not in task}
 
 
-def _again(options: argparse.Namespace, overrides: dict[str, Any]) -> str:
+def _again(options: argparse.Namespace, overrides: dict[str, Any]) -> list[str]:
     """The arguments with which `star render --episode` shows an episode of this evaluation."""
     words = []
     if options.evaluation_seed:
@@ -67,7 +66,7 @@ def _again(options: argparse.Namespace, overrides: dict[str, Any]) -> str:
     for key, value in overrides.items():
         name = "--episodes" if key == "trainer.eval_episodes" else f"--{key}"
         words += [name, value if isinstance(value, str) else json.dumps(value)]
-    return shlex.join(words)
+    return words
 
 
 def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from star.agent.episodes import MEASURES
+from star.config import plugins
 from star.report.statistics import ABOVE
 
 _PLAIN_WIDTH = 200  # columns where nobody looks at a terminal
@@ -22,7 +22,7 @@ _SHOWN = 3  # failed episodes named in a table
 Row = Mapping[str, Any]
 
 
-def show(rows: Sequence[Row], comparison: Mapping[str, Any] | None, *, again: str) -> None:
+def show(rows: Sequence[Row], comparison: Mapping[str, Any] | None, *, again: Sequence[str]) -> None:
     """Print the rows of `star.agent.exams.evaluate`, a line for each seed, and what `compare` found.
 
     `again` are the arguments that tell `star render` of which evaluation an episode is.
@@ -32,9 +32,9 @@ def show(rows: Sequence[Row], comparison: Mapping[str, Any] | None, *, again: st
     failing = next(((row, seed) for row in rows for seed in row["seeds"] if seed["failed"]), None)
     if failing:
         row, seed = failing
-        words = ["star", "render", "--run", row["run"], "--checkpoint", str(row["env_steps"])]
-        words += ["--seed", str(seed["seed"]), "--episode", str(seed["failed"][0])]
-        print(f"watch a failure: {shlex.join(words)} {again}{' ' * bool(again)}--out failure.html")
+        words = ["--run", row["run"], "--checkpoint", row["env_steps"]]
+        words += ["--seed", seed["seed"], "--episode", seed["failed"][0]]
+        print("watch a failure:", plugins.command("render", *words, *again, "--out", "failure.html"))
     if comparison:
         console.print(groups(comparison["groups"]))
         if comparison["improvement"]:

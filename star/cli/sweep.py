@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import shlex
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from star.cli.words import count, given_back, new_place, typed
+from star.cli.words import count, given_back, new_place
+from star.config import plugins
 
 HELP = "try many settings"
 DESCRIPTION = """\
@@ -48,13 +48,13 @@ def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         summary = work.run(found, out, storage=options.storage, quiet=options.quiet)
     Console().print(results.table(summary.rows, found))
     if not summary.finished:
-        again = ["sweep", str(options.file), *(["--storage", "URL"] if options.storage else []), "--out", str(out)]
-        print(f"interrupted; running trials were given back; go on with: star {shlex.join(again)}")
+        again = plugins.command("sweep", options.file, *(["--storage", "URL"] if options.storage else []), "--out", out)
+        print(f"interrupted; running trials were given back; go on with: {again}")
         return 130
     print(f"trials:  {out}/trials.csv")
     if summary.best is None:
         print("no trial was completed")
         return 1
     print(f"figures: {out}/figures/\nbest:    trial {summary.best['trial']}")
-    print(f"next:    star train {typed(out / 'best.yaml')}")
+    print(f"next:    {plugins.command('train', out / 'best.yaml')}")
     return 0

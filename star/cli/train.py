@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from star.cli.words import count, given_back, new_place, typed
-from star.config import kinds
+from star.cli.words import count, given_back, new_place
+from star.config import kinds, plugins
 from star.config.loading import load, load_run
 from star.config.run import RunConfig
 from star.config.section import ConfigError
@@ -97,24 +97,24 @@ def _say_how_it_ended(result: Result, config: RunConfig) -> None:
         print(f"stopped: {result.fault}; {_after_a_fault(result, config)}", file=sys.stderr)
         return
     if result.interrupted:
-        again = f"star train --resume {typed(run_dir)}"
+        again = plugins.command("train", "--resume", run_dir)
         print(f"interrupted at {result.env_steps:,} {kind.unit}; go on with: {again}")
         return
     measure = kind.measures[0]
     score = "" if result.score is None else f", {measure.name} {result.score:.2f} {measure.where}".rstrip()
     print(f"trained {result.env_steps:,} {kind.unit}{score}")
     print(f"figure:  {run_dir}/figures/summary.png\nmetrics: {run_dir}/metrics.jsonl")
-    print(f"next:    star evaluate {typed(run_dir)}")
+    print(f"next:    {plugins.command('evaluate', run_dir)}")
 
 
 def _after_a_fault(result: Result, config: RunConfig) -> str:
     """What is left of a run whose numbers were not finite, and how to go on."""
-    flags = "--trainer.on_non_finite rollback"
+    flags = ["--trainer.on_non_finite", "rollback"]
     if config.trainer.on_non_finite == "rollback":
-        flags += f" --trainer.rollbacks {2 * config.trainer.rollbacks}"
+        flags += ["--trainer.rollbacks", str(2 * config.trainer.rollbacks)]
     if result.saved is None:
-        return f"there is no checkpoint from before; begin anew with {flags}"
+        return f"there is no checkpoint from before; begin anew with {' '.join(flags)}"
     return (
         f"the checkpoint of {result.saved:,} {kinds.of(config).unit} is sound; "
-        f"go on with: star train --resume {typed(result.run_dir)} {flags}"
+        f"go on with: {plugins.command('train', '--resume', result.run_dir, *flags)}"
     )

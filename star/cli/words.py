@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -93,11 +92,6 @@ def count(most: int = 2**31 - 1) -> Callable[[str], int]:
         return int(text)
 
     return read
-
-
-def typed(path: Path) -> str:
-    """A path as one types it in a shell."""
-    return shlex.quote(str(path))
 
 
 def refuse_settings(overrides: dict[str, Any]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import re
+import shlex
 import sys
 from pathlib import Path
 from typing import TypeVar
@@ -29,6 +30,12 @@ def is_plugin(name: object) -> bool:
 def trust(module: str) -> None:
     """Let the module be imported, here and in processes that are started from here."""
     os.environ[TRUSTED] = ",".join(dict.fromkeys([*_trusted(), module]))
+
+
+def command(*words: object) -> str:
+    """`star` with these words, to be typed in a shell, and with the modules that it lets in here."""
+    imports = [word for module in _trusted() for word in ("--import", module)]
+    return shlex.join(["star", *map(str, words), *imports])
 
 
 def find(name: str, kind: type[Kind]) -> Kind:

@@ -9,14 +9,13 @@ What no run writes is refused in one line.
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from star.config import kinds
+from star.config import kinds, plugins
 from star.config.loading import changed, dotted, parse
 from star.config.run import RunConfig
 from star.config.section import ConfigError
@@ -150,12 +149,12 @@ def _again(run_dir: Path, config: RunConfig, stretches: Sequence[Stretch]) -> st
             tables[-1][_TOTAL] = began
         tables.append(table)
     copy = f"{run_dir}-again"
-    commands = [["star", "train", str(run_dir / "config.yaml"), "--run-dir", copy]]
-    commands += [["star", "train", "--resume", copy] for _ in tables[1:]]
+    commands = [["train", str(run_dir / "config.yaml"), "--run-dir", copy]]
+    commands += [["train", "--resume", copy] for _ in tables[1:]]
     noted = [dotted(config)] + [tables[0]] * (len(tables) - 1)
     for command, before, table in zip(commands, noted, tables, strict=True):
         command += [word for key, value in changed(before, table).items() for word in (f"--{key}", _worded(value))]
-    return " && ".join(map(shlex.join, commands))
+    return " && ".join(plugins.command(*words) for words in commands)
 
 
 def _checked(lines: JsonLines, kinds: Kinds) -> list[Row]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from envs.common import files
 from star import devices
+from star.config import plugins
 from star.config.loading import changed, dotted, load
 from star.config.run import RunConfig
 from star.config.section import ConfigError
@@ -27,7 +27,7 @@ def make(run_dir: Path) -> None:
     try:
         used = run_dir.is_dir() and any(not entry.name.startswith(_BEGUN) for entry in run_dir.iterdir())
         if used or (run_dir.exists() and not run_dir.is_dir()):
-            again = f"star train --resume {shlex.quote(str(run_dir))}"
+            again = plugins.command("train", "--resume", run_dir)
             raise ConfigError(f"{run_dir}: is not empty; choose another --run-dir, or go on with it: {again}")
         devices.wait("the run directory is empty")
         run_dir.mkdir(parents=True, exist_ok=True)

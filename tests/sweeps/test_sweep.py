@@ -379,7 +379,7 @@ for line in sys.stdin:
 def master():
     """A process that begins workers: for a line with a plan, a database and a number, their pids and exit codes."""
     where = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "-c", WORKERS.format(tests=str(ROOT / "tests"))]
+    command = [sys.executable, "-c", WORKERS.format(tests=str(ROOT / "tests/sweeps"))]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(command, **pipes, text=True, bufsize=1, env=os.environ | where) as process:
         yield process
@@ -394,8 +394,10 @@ def shared(master, url, *, workers):
     ledger = open_ledger(found, url)
     print(Path("plan").resolve(), url, workers, file=master.stdin)
     pids = [int(pid) for pid in master.stdout.readline().split()]
-    busy = []
+    assert len(pids) == workers
+    busy, late = [], time.monotonic() + 60
     while not busy:
+        assert time.monotonic() < late, "no worker began a trial"
         running = [trial for trial in ledger.trials() if trial.state.name == "RUNNING"]
         busy = [trial.user_attrs["worker"] for trial in running if "worker" in trial.user_attrs]
     killed = int(busy[-1].rpartition(":")[2])  # the last to begin is the last to end by itself

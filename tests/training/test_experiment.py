@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shlex
 import shutil
 import sys
 from pathlib import Path
@@ -82,6 +83,20 @@ def test_it_trains_and_goes_on_bit_for_bit(here):
     assert found.keys() == expected.keys() == {"values", "epoch", "key"} and expected["values"].all()
     for name, array in expected.items():
         np.testing.assert_array_equal(found[name], array, err_msg=name)
+
+
+def test_what_to_type_next_lets_its_module_in_and_can_be_pasted(here, capsys, monkeypatch):
+    monkeypatch.setenv("STAR_IMPORT", "")  # noted, so that what a command adds to it goes again
+    assert main(["train", "run.yaml", "--run-dir", "a run", "--quiet", "--import", "bandit"]) == 0
+    told = capsys.readouterr().out.splitlines()[-1]
+    assert told == "next:    star evaluate 'a run' --import bandit"
+    assert main(["train", "run.yaml", "--run-dir", "a run", "--quiet"]) == 2
+    assert capsys.readouterr().err.endswith(": star train --resume 'a run' --import bandit\n")
+    assert main(["report", "a run", "--out", "page.html"]) == 0
+    assert "star train 'a run/config.yaml' --run-dir 'a run-again' --import bandit" in Path("page.html").read_text()
+    monkeypatch.setenv("STAR_IMPORT", "")
+    sys.modules.pop("bandit")
+    assert main(shlex.split(told.removeprefix("next:"))[1:]) == 0
 
 
 def test_the_other_commands_work_on_it(here, capsys):
