@@ -292,6 +292,7 @@ def recording(request, breaking_env):
         "tutor.reward": "distance" if published else "progress",
         "controller.reward": "distance" if published else "progress",
         "tutor.relative_bounds": not published,
+        "tutor.straight": not published,
         "tutor.reward_scale": 0.1,
         "controller.reward_scale": 0.5,
         "commander.practice": 0.6,

@@ -33,7 +33,8 @@ from star import cli, sgim
 from star.abstraction import regions
 from star.agent.experiment import make_env
 from star.cli.streams import unbroken
-from star.cli.words import new_place, split_settings, typed
+from star.cli.words import new_place, split_settings
+from star.config import plugins
 from star.config.loading import parse
 from star.sgim import teachers
 from star.spec import Spec
@@ -207,8 +208,9 @@ def test_goal_selection_alone_refuses_the_modes_that_environments_refuse(mode):
             regions.create(([0.0], [3.0]), [[1.0, 2.0]], max_regions=8)
 
 
-def test_printed_commands_can_be_typed(tmp_path):
-    assert typed(Path("runs/a b")) == "'runs/a b'" and typed(Path("runs/ab")) == "runs/ab"
+def test_printed_commands_can_be_typed(tmp_path, monkeypatch):
+    monkeypatch.delenv("STAR_IMPORT", raising=False)
+    assert plugins.command("evaluate", Path("runs/a b")) == "star evaluate 'runs/a b'"
     (tmp_path / "a b").mkdir()
     (tmp_path / "a b" / "x").touch()
     command = ["train", str(ROOT / "configs/point_maze.yaml"), "--run-dir", str(tmp_path / "a b")]

@@ -196,9 +196,9 @@ MENDS = (
     Mend(
         "printed commands are not quoted",
         _use("printed_commands_can_be_typed"),
-        "star/cli/words.py",
-        "return shlex.quote(str(path))",
-        "return str(path)",
+        "star/config/plugins.py",
+        'return shlex.join(["star", *map(str, words), *imports])',
+        'return " ".join(["star", *map(str, words), *imports])',
     ),
     Mend(
         "python -m star is unknown",

@@ -135,6 +135,7 @@ ROWS: dict[str, Row] = {
     "ablations/no_mask": Row(),
     "ablations/no_practice": Row(),
     "ablations/no_refinement": Row(),
+    "ablations/no_straight": Row(),
     "ablations/one_box": Row(),
     "ablations/one_box_goals": Row(),
     "ablations/one_box_goals_unrefined": Row(),

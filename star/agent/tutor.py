@@ -8,6 +8,10 @@
     act         once a segment
     experience  the segment, as one transition; it learns from `unroll` of them at a time
 
+A target box that lies within reach of one subgoal needs none on the way to it: with `straight` its centre is the
+subgoal, in training and in greedy episodes, and of these decisions nothing is learnt. So agents stay where they were
+sent to.
+
 Where SGIM says so, a teacher sets the subgoal, straight ahead to his waypoint, which the Tutor imitates; or it is
 random, of which the Tutor learns nothing.
 
@@ -91,13 +95,25 @@ def act(
     """A subgoal for each environment, on the way to its target `box`."""
     seen = observe(section, task, obs, box)
     action = learners.act(section, state, seen, deterministic=not explore, key=key)
+    if section.straight:
+        action = jnp.where(within_reach(task, obs, box)[:, None], _straight(task, obs, box.centre), action)
     if marks.way is not None and marks.way.led is not None:
-        straight = jnp.clip(task.spec.towards(obs, marks.way.point) / task.spec.scale, -1.0, 1.0)
-        action = jnp.where(marks.way.led[:, None], straight, action)
+        action = jnp.where(marks.way.led[:, None], _straight(task, obs, marks.way.point), action)
     if marks.own is not None:
         anything = jax.random.uniform(jax.random.fold_in(key, 1), action.shape, minval=-1.0)
         action = jnp.where(marks.own[:, None], action, anything)
     return Choice(subgoal=subgoal(action, task.spec.scale), seen=seen, action=action)
+
+
+def within_reach(task: Task, obs: Float[Array, "*batch obs"], box: Box) -> Bool[Array, "*batch"]:
+    """Where every point of `box` is one that a subgoal can be set to."""
+    farthest = jnp.abs(box.centre - task.spec.abstract(obs)) + (box.upper - box.lower) / 2
+    return jnp.all(farthest <= task.spec.scale[: farthest.shape[-1]], axis=-1)
+
+
+def _straight(task: Task, obs: Float[Array, "*batch obs"], point: Float[Array, "*batch d"]) -> Float[Array, "*batch p"]:
+    """The action that aims at an abstract `point`, or as far towards it as a subgoal may lie."""
+    return jnp.clip(task.spec.towards(obs, point) / task.spec.scale, -1.0, 1.0)
 
 
 def subgoal(action: Float[Array, "*batch p"], scale: Float[Array, "p"]) -> Float[Array, "*batch p"]:
@@ -120,6 +136,8 @@ def experience(
         )
         extras = Trace(states=states, actions=actions, achieved=path)
     weight = jnp.ones_like(lost)
+    if section.straight:
+        weight *= ~within_reach(task, segment.obs[0], segment.box)
     if marks.own is not None:
         weight *= marks.own
     if marks.led is not None:  # somebody else's, to be imitated

@@ -154,7 +154,11 @@ def test_the_tutors_chain_is_cut_where_the_target_or_the_episode_ends(recording)
         terminated = (recording.steps.terminated[i, :, b] * recording.steps.alive[i, :, b]).any()
         assert recording.tutor.terminated[i, b] == terminated
         assert recording.tutor.cut[i, b] == (recording.before.memory.clock[i, b] == K - L or ended(recording, i, b))
-    assert (recording.tutor.weight == 1).all()
+    box, position = recording.passed.box, recording.spec.abstract(recording.passed.obs[:, 0])
+    farthest = np.maximum(np.abs(box.lower - position), np.abs(box.upper - position))
+    near = (farthest <= recording.spec.subgoal_scale).all(axis=-1)
+    assert near.any() and not near.all()
+    np.testing.assert_array_equal(recording.tutor.weight, 1 if recording.published else ~near)
 
 
 class Epoch:

@@ -7,10 +7,12 @@ import pytest
 
 from star.abstraction.regions import Box
 from star.agent import tutor
+from star.agent.segments import Segment
 from star.agent.task import Task
 from star.agent.tutor import Trace
 from star.config import loading
 from star.learners.replay import Transition
+from star.sgim.lessons import Marks
 from star.spec import Spec
 
 N, L = 6, 4
@@ -62,6 +64,39 @@ def test_whoever_is_in_the_box_around_a_goal_has_reached_it(radius, indices):
     corner = np.linalg.norm(box.upper - goal)
     assert corner <= 0.7 * radius + 1e-5
     assert (box.upper - goal).max() == pytest.approx(min(1.0, 0.7 * radius / len(indices) ** 0.5), abs=1e-5, rel=1e-4)
+
+
+@pytest.mark.parametrize("straight", [True, False])
+def test_a_box_within_reach_is_aimed_at_and_teaches_nothing(straight):
+    """The first box lies within reach of (10, 5), the second sticks out of it, the third is far away."""
+    section = settings(straight=straight, ppo={"hidden": [4]})
+    spec = Spec(
+        state_dim=3,
+        action_size=1,
+        episode_length=1,
+        abstract_indices=(0, 1),
+        goal_indices=(0, 1),
+        subgoal_scale=(10.0, 5.0),
+        space=((0.0, 0.0), (90.0, 90.0)),
+        region_cuts=((), ()),
+        success_radius=1.0,
+    )
+    task = Task.of(loading.parse({}), spec)
+    obs = jnp.tile(jnp.array([1.0, 2.0, 7.0, 0.0, 0.0]), (3, 1))
+    box = Box(
+        lower=jnp.array([[5.0, 4.0], [5.0, 4.0], [50.0, 4.0]]), upper=jnp.array([[7.0, 6.0], [7.0, 8.0], [52.0, 6.0]])
+    )
+    state, marks = tutor.init(jax.random.key(0), section, task), Marks()
+    choice = tutor.act(section, task, state, obs, box, marks, explore=True, key=jax.random.key(1))
+    aimed = np.linalg.norm(choice.subgoal - (box.centre - obs[:, :2]), axis=1) < 1e-6
+    assert aimed.tolist() == [straight, False, False]
+    steps = jnp.zeros((L, 3))
+    passed = Segment(
+        obs=jnp.stack([obs] * (L + 1)), seen=(), subgoal=(), action=steps, terminated=steps, ended=steps, success=steps,
+        distance=steps, alive=steps + 1, non_finite=steps, overflow=steps, box=box, choice=choice,
+    )  # fmt: skip
+    learnt = tutor.experience(section, task, passed, marks, renewed=jnp.zeros(3, bool))
+    np.testing.assert_array_equal(learnt.weight, [0.0 if straight else 1.0, 1.0, 1.0])
 
 
 def test_subgoals_are_clipped_to_their_scale():

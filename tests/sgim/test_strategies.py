@@ -551,7 +551,8 @@ def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(t
 def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_tutor_imitates_them(
     tiny, breaking_env, turning, monkeypatch
 ):
-    agent = loading.parse({**tiny, "sgim": {"teachers": [GUIDE], "imitation": 2.0}}).hyper()
+    tutoring = {**tiny["tutor"], "straight": False}
+    agent = loading.parse({**tiny, "tutor": tutoring, "sgim": {"teachers": [GUIDE], "imitation": 2.0}}).hyper()
     lesson, _, _, _ = lesson_of(agent.sgim)
     n = breaking_env.num_envs
     lesson = jax.tree.map(lambda x: x[:n], lesson)
