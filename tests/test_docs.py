@@ -28,7 +28,7 @@ PAGES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for
 PAGES["README.md"] = (ROOT / "README.md").read_text(encoding="utf-8")
 DEFAULTS = {key: default for key, default, _ in fields(Config)}
 WRITTEN_BY_THE_TRAINER = {"seed", "env_steps", "wall_s", "env_steps_per_s"} | {
-    f"eval/{name}" for name in ("success_any", "success_final", "distance", "return", "flipped")
+    f"eval/{name}" for name in ("success_any", "success_final", "distance", "return", "flipped", "time_at_goal")
 }
 
 

@@ -11,9 +11,11 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import envs
 from envs.arena import Arena
 from star.abstraction import reachability
 from star.abstraction.forward_model import Outcome
@@ -378,3 +380,32 @@ def test_the_check_of_learning_tells_a_bit_from_rounding_and_rounding_from_more(
     ):
         assert len(CHECK.bits(old, old | new)) == different
         assert len(CHECK.rounding(old, old | new)) == far
+
+
+@pytest.mark.parametrize("loops", [0, 3])
+def test_a_maze_has_its_loops_and_a_way_as_long_as_it_says(tmp_path, capsys, loops):
+    script = load("results/mazes")
+    files = [tmp_path / name for name in ("a.yaml", "again.yaml", "b.yaml")]
+    for file, seed in zip(files, ("0", "0", "1"), strict=True):
+        words = ["--seed", seed, "--rows", "4", "--loops", str(loops), "--way", "60", "90", "--out", str(file)]
+        script.main(words)
+    one, again, other = (file.read_text() for file in files)
+    assert one == again != other
+    rows = yaml.safe_load(one)["map"].split()
+    free = {(r, c) for r, row in enumerate(rows) for c, symbol in enumerate(row) if symbol != "1"}
+    joined = sum((r + dr, c + dc) in free for r, c in free for dr, dc in ((0, 1), (1, 0)))
+    assert joined - len(free) + 1 == loops  # of one connected piece
+    (start,), (goal,) = ([(r, c) for r, c in free if rows[r][c] == symbol] for symbol in "rg")
+    steps, edge = {start: 0}, [start]
+    for r, c in edge:  # grows as it is gone through
+        for cell in ((r, c + 1), (r, c - 1), (r + 1, c), (r - 1, c)):
+            if cell in free and cell not in steps:
+                steps[cell] = steps[r, c] + 1
+                edge.append(cell)
+    assert steps.keys() == free and steps[goal] == max(steps.values())
+    way = float(one.split()[1])  # cuts corners
+    assert 60 <= way <= 90 and 0.7 * 4 * steps[goal] <= way <= 4 * steps[goal]
+    assert envs.make("point_maze", map=str(files[0])).arena.cell == 4
+    with pytest.raises(SystemExit, match="2"):
+        script.main([*words, "--rows", "1", "--columns", "2"])
+    assert capsys.readouterr().err == "error: --way: no maze of 1 x 2 rooms has one of 60 to 90 m\n"

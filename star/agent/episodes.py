@@ -32,13 +32,13 @@ def summarise(episode: Episode) -> dict[str, Any]:
     """Statistics of the episodes of one seed (arrays [E]).
 
     `success_any` and `success_final` come with Wilson score intervals, `distance` (units of the state, at the end of
-    the episode) and `return` (sum of the task's rewards) with Student's t intervals. `flipped` is the share that ends
-    with the body on its back, `failed_flipped` the same of those that never reach the goal, None if all do. Keys ending
-    in `_interval` hold [low, high] at 95 %.
+    the episode), `return` (sum of the task's rewards) and `time_at_goal` (env steps) with Student's t intervals.
+    `flipped` is the share that ends with the body on its back, `failed_flipped` the same of those that never reach the
+    goal, None if all do. Keys ending in `_interval` hold [low, high] at 95 %.
     """
-    any_, final, distance, total, flipped = (
-        np.asarray(x, np.float64).ravel()
-        for x in (episode.success_any, episode.success_final, episode.distance, episode.total, episode.flipped)
+    any_, final, distance, total, flipped, there = (
+        np.asarray(getattr(episode, name), np.float64).ravel()
+        for name in ("success_any", "success_final", "distance", "total", "flipped", "time_at_goal")
     )
     return {
         "episodes": len(any_),
@@ -50,23 +50,28 @@ def summarise(episode: Episode) -> dict[str, Any]:
         "distance_interval": statistics.mean_interval(distance),
         "return": float(total.mean()),
         "return_interval": statistics.mean_interval(total),
+        "time_at_goal": float(there.mean()),
+        "time_at_goal_interval": statistics.mean_interval(there),
         "flipped": float(flipped.mean()),
         "failed_flipped": float(flipped[any_ == 0].mean()) if (any_ == 0).any() else None,
     }
 
 
-def summarise_way(trials: Trials, shortest: np.ndarray | None, *, dt: float) -> dict[str, Any]:
-    """What it takes to reach the goal: `steps_to_goal`, `seconds_to_goal`, `path_length` (m), and `spl`.
+def summarise_way(trials: Trials, shortest: np.ndarray | None, *, dt: float, length: int) -> dict[str, Any]:
+    """What it takes to reach the goal: `steps_to_goal`, `seconds_to_goal`, `path_length` (m), `stayed` and `spl`.
 
-    The first three are means over the episodes that reach it, with Student's t intervals, None if none does. `shortest`
-    are the lengths of the shortest ways (m, infinite where there is none), like `trials.path`; without them `spl` is
-    None. `dt` is the length of an env step (s).
+    `stayed` is the share of the env steps from the first arrival on that are at the goal, in episodes of `length` env
+    steps. All but `spl` are means over the episodes that reach it, with Student's t intervals, None if none does.
+    `shortest` are the lengths of the shortest ways (m, infinite where there is none), like `trials.path`; without them
+    `spl` is None. `dt` is the length of an env step (s).
     """
-    reached, steps, path = (
-        np.asarray(x, np.float64).ravel() for x in (trials.episode.success_any, trials.steps, trials.path)
+    reached, there, steps, path = (
+        np.asarray(x, np.float64).ravel()
+        for x in (trials.episode.success_any, trials.episode.time_at_goal, trials.steps, trials.path)
     )
     found: dict[str, Any] = {}
-    for name, values in (("steps_to_goal", steps), ("seconds_to_goal", steps * dt), ("path_length", path)):
+    ways = {"steps_to_goal": steps, "seconds_to_goal": steps * dt, "path_length": path}
+    for name, values in (ways | {"stayed": there / (length - steps + 1)}).items():
         values = values[reached > 0]
         found |= {
             name: float(values.mean()) if len(values) else None,

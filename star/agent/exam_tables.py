@@ -49,7 +49,7 @@ def evaluations(rows: Sequence[Row]) -> Table:
         table.add_column(name)
     for name in ("env steps", "seed", "episodes"):
         table.add_column(name, justify="right")
-    for name in ("success_any", "success_final", "s to goal", "m to goal", "SPL", "end distance"):
+    for name in ("success_any", "success_final", "s to goal", "m to goal", "SPL", "stayed", "end distance"):
         table.add_column(name, justify="right")
     table.add_column("failed")
     several = any(len(row["seeds"]) > 1 for row in rows)
@@ -118,7 +118,7 @@ def _title(rows: Sequence[Row]) -> str:
 
 def _cells(row: Row) -> list[str]:
     success = [_interval(row[name], row[f"{name}_interval"]) for name in MEASURES]
-    means = (("seconds_to_goal", ".1f"), ("path_length", ".1f"), ("spl", ".2f"), ("distance", ".2f"))
+    means = (("seconds_to_goal", ".1f"), ("path_length", ".1f"), ("spl", ".2f"), ("stayed", ".2f"), ("distance", ".2f"))
     return [str(row["episodes"]), *success, *("-" if row[name] is None else format(row[name], f) for name, f in means)]
 
 

@@ -267,10 +267,10 @@ def shortest_ways(course: Course, trials: Trials) -> np.ndarray | None:
 
 
 def _row(entry: _Entry, exam: Exam, trials: Trials, shortest: np.ndarray | None) -> dict[str, Any]:
-    course, dt = entry.course, entry.course.env.dt
+    course, dt, length = entry.course, entry.course.env.dt, entry.course.env.episode_length
 
     def summary(trials: Trials, shortest: np.ndarray | None) -> dict[str, Any]:
-        return summarise(trials.episode) | summarise_way(trials, shortest, dt=dt)
+        return summarise(trials.episode) | summarise_way(trials, shortest, dt=dt, length=length)
 
     per_seed = []
     for i, seed in enumerate(entry.program.seeds):

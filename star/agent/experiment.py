@@ -31,7 +31,7 @@ from star.spec import Spec
 from star.training.experiment import Experiment, over_seeds
 from star.training.journal import mean
 
-_EVALUATED = ("success_any", "success_final", "distance", "return", "flipped")
+_EVALUATED = ("success_any", "success_final", "distance", "return", "flipped", "time_at_goal")
 _SHARE = "sgim/share_"
 _FAULTS = ("env/non_finite", "env/overflow")
 

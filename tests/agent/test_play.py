@@ -180,22 +180,24 @@ def test_an_environment_that_ended_is_reset_and_no_other_is(recording):
 
 
 def test_episode_statistics_are_those_of_the_steps_since_the_last_reset(recording):
-    any_, total = np.zeros(B), np.zeros(B)
+    any_, total, there = np.zeros(B), np.zeros(B), np.zeros(B)
     for i, b in streams_and_segments(recording):
         for t in range(L):
             if recording.steps.alive[i, t, b]:
                 obs = recording.steps.next_obs[i, t, b]
                 distance = np.linalg.norm(obs[:2] - obs[4:6])
                 any_[b], total[b] = max(any_[b], distance < 5), total[b] - distance
+                there[b] += distance < 5
                 final, flipped = float(distance < 5), recording.steps.terminated[i, t, b]
         seen = recording.advanced.episode
         assert seen.success_any[i, b] == any_[b]
         assert seen.success_final[i, b] == final
         assert seen.flipped[i, b] == flipped
+        assert seen.time_at_goal[i, b] == there[b]
         np.testing.assert_allclose(seen.distance[i, b], distance, rtol=1e-5)
         np.testing.assert_allclose(seen.total[i, b], total[b], rtol=1e-4)
         if ended(recording, i, b):
-            any_[b] = total[b] = 0
+            any_[b] = total[b] = there[b] = 0
     np.testing.assert_allclose(recording.last.episode.total, total, rtol=1e-4)
 
 

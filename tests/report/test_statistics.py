@@ -19,11 +19,12 @@ GROUP = {"maze": [0.1, 0.9, 0.4, 0.4], "rooms": [0.0, 1.0, 0.7]}
 OTHER = {"maze": [0.2, 0.4], "rooms": [0.7, 0.1, 0.9, 1.0], "fall": [0.5]}
 
 
-def trials(reached, steps, path):
+def trials(reached, steps, path, there=None):
     """Episodes that begin at the origin."""
     unused = np.zeros(len(reached))
     rest = dict.fromkeys(("success_final", "distance", "total", "flipped"), unused)
-    ended = Episode(success_any=np.array(reached, float), **rest)
+    there = unused if there is None else np.array(there, float)
+    ended = Episode(success_any=np.array(reached, float), time_at_goal=there, **rest)
     places = np.zeros((len(reached), 2))
     return Trials(episode=ended, steps=np.array(steps, float), path=np.array(path, float), start=places, goal=places)
 
@@ -132,13 +133,22 @@ def test_a_single_score_stays_as_it_is_while_others_are_drawn():
 
 
 def test_time_and_way_are_means_over_the_episodes_that_arrive():
-    found = episodes.summarise_way(trials([1, 0, 1], [10, 500, 30], [5.0, 99.0, 9.0]), None, dt=0.1)
+    found = episodes.summarise_way(trials([1, 0, 1], [10, 500, 30], [5.0, 99.0, 9.0]), None, dt=0.1, length=500)
     assert (found["steps_to_goal"], found["path_length"]) == (20.0, 7.0)
     assert found["seconds_to_goal"] == pytest.approx(2.0)
     low, high = found["path_length_interval"]
     assert low < 7.0 < high and found["spl"] is None
-    nobody = episodes.summarise_way(trials([0, 0], [500, 500], [9.0, 9.0]), np.ones(2), dt=0.1)
+    nobody = episodes.summarise_way(trials([0, 0], [500, 500], [9.0, 9.0]), np.ones(2), dt=0.1, length=500)
     assert nobody["steps_to_goal"] is nobody["path_length_interval"] is None and nobody["spl"] == 0.0
+
+
+def test_who_stayed_at_the_goal_was_there_from_the_first_arrival_to_the_end():
+    """Arrivals at env steps 1, 401 and 500 of 500: there all the time, half of it, and at the last step alone."""
+    found = trials([1, 1, 1, 0], [1, 401, 500, 500], [0.0] * 4, there=[500, 50, 1, 0])
+    assert episodes.summarise_way(found, None, dt=0.1, length=500)["stayed"] == pytest.approx(2.5 / 3)
+    assert episodes.summarise(found.episode)["time_at_goal"] == 551 / 4
+    nobody = episodes.summarise_way(trials([0], [500], [9.0]), None, dt=0.1, length=500)
+    assert nobody["stayed"] is nobody["stayed_interval"] is None
 
 
 def test_success_is_weighted_by_how_much_longer_than_the_shortest_the_way_was():
@@ -148,7 +158,7 @@ def test_success_is_weighted_by_how_much_longer_than_the_shortest_the_way_was():
 
 
 def test_the_share_of_failures_that_end_on_the_back_is_none_where_nothing_fails():
-    rest = dict.fromkeys(("success_final", "distance", "total"), np.zeros(4))
+    rest = dict.fromkeys(("success_final", "distance", "total", "time_at_goal"), np.zeros(4))
     ended = Episode(success_any=np.array([1.0, 0.0, 0.0, 0.0]), flipped=np.array([1.0, 1.0, 0.0, 1.0]), **rest)
     found = episodes.summarise(ended)
     assert found["flipped"] == 3 / 4 and found["failed_flipped"] == 2 / 3
