@@ -26,6 +26,7 @@ from hypothesis import settings  # noqa: E402
 
 import envs  # noqa: E402
 from envs import arena, opengl  # noqa: E402
+from envs.common import modes  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
 from star.agent import commander, controller, levels, play, tutor  # noqa: E402
@@ -131,6 +132,7 @@ def compiled_once():
     build, known = programs.build, {}
 
     def shared(config):
+        modes.check_training()
         key = compiled(config)
         if key is None:
             return build(config)
