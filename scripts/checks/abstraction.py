@@ -35,7 +35,7 @@ from star.agent.decisions import Decision, Roadmap, Successors
 from star.agent.experiment import make_env
 from star.agent.sections import AgentConfig
 from star.agent.state import TrainState
-from star.config.loading import load
+from star.config.loading import load_run
 from star.spec import Spec
 from star.training import program as programs
 from star.training.checkpoint import load_state
@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
 
-    config = load(options.run / "config.yaml", {"env.engine": "auto"})
+    config = load_run(options.run, {"env.engine": "auto"})
     program = programs.build(config)
     step, states = load_state(program, options.run, options.checkpoint)
     agent, spec = program.config.hyper(), program.experiment.spec

@@ -36,7 +36,7 @@ from star.abstraction.reachability import Network
 from star.abstraction.sections import ForwardModelConfig
 from star.agent.sections import AgentConfig
 from star.agent.state import TrainState
-from star.config.loading import load, parse
+from star.config.loading import load_run, parse
 from star.training import program as programs
 from star.training import provenance
 from star.training.checkpoint import load_state
@@ -237,7 +237,7 @@ def main(arguments: list[str] | None = None) -> int:
     report |= {"triples": check_triples(options.triples), "verdicts": []}
     print(json.dumps(report["triples"]), flush=True)
     for run in options.runs:
-        program = programs.build(load(run / "config.yaml", {"env.engine": "auto"}))
+        program = programs.build(load_run(run, {"env.engine": "auto"}))
         step, states = load_state(program, run, "last")
         for i, seed in enumerate(program.seeds):
             state = jax.tree.map(lambda x, i=i: x[i], states)

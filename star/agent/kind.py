@@ -42,6 +42,7 @@ STAR = Kind(
     format=FORMAT,
     migrations=TO_NEXT,
     harmless=("env.engine",),
+    older={"tutor.straight": False},
     anywhere={"env.engine": "auto"},
     commands={
         "evaluate": _lazily("commands", "evaluate"),

@@ -90,6 +90,8 @@ class Kind(NamedTuple):
     """For each older format how to make the next one of it."""
     harmless: tuple[str, ...] = ()
     """Beginnings of settings that may differ when a run goes on, besides numbers and those of `trainer`."""
+    older: Mapping[str, Any] = {}
+    """Values of settings in runs that are older than these and do not name them, where they are not the defaults."""
     anywhere: Mapping[str, Any] = {}
     """Settings of agents that act on another machine than that of their training."""
     commands: Mapping[str, Callable[..., Any]] = {}

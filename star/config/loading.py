@@ -46,7 +46,8 @@ def experiment_of(run_dir: Path) -> str:
 
 def load_run(run_dir: Path, overrides: Mapping[str, Any]) -> Any:
     """The settings of a run, with others in their place; raises `UserError`."""
-    return load(_config_file(run_dir), overrides)
+    path = _config_file(run_dir)
+    return parse(read_file(path), overrides, source=str(path), kept=True)
 
 
 def load_to_act(run_dir: Path, overrides: Mapping[str, Any]) -> Any:
@@ -100,14 +101,24 @@ def read_file(path: Path) -> dict[str, Any]:
 
 
 def parse(
-    values: Mapping[str, Any], overrides: Mapping[str, Any] | None = None, *, source: str = "configuration"
+    values: Mapping[str, Any],
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    source: str = "configuration",
+    kept: bool = False,
 ) -> Any:
-    """Validate nested `values` after applying dotted `overrides`; raises `UserError`. As in `load`."""
+    """Validate nested `values` after applying dotted `overrides`; raises `UserError`. As in `load`.
+
+    What is `kept` by a run or a checkpoint names all settings that there were: one that it does not name is newer.
+    """
     nested = _with_overrides(plain(values), plain(overrides or {}))
     try:
-        model = kinds.find(nested.get("experiment", DEFAULT)).Config
+        kind = kinds.find(nested.get("experiment", DEFAULT))
     except UserError as error:
         raise ConfigError(f"{source}: {error}") from None
+    model = kind.Config
+    if kept:
+        nested = _merged(_with_overrides({}, kind.older), nested)
     try:
         return model.model_validate(nested)
     except ValidationError as error:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from star.config import kinds, plugins
-from star.config.loading import changed, dotted, parse
+from star.config.loading import changed, dotted, load, parse
 from star.config.run import RunConfig
 from star.config.section import ConfigError
 from star.training.journal import Journal, JsonLines, by_step
@@ -88,7 +88,7 @@ def read(run_dir: Path, config: RunConfig, *, name: str) -> Run:
         tables=[row for rows in _complete(_checked(journal.tables, {**_TABLES, **kind.row}), seeds) for row in rows],
         starts=starts,
         stretches=[stretches],
-        again=[_again(run_dir, config, stretches)],
+        again=[_again(run_dir, stretches)],
     )
 
 
@@ -138,7 +138,7 @@ def _stretches(starts: Sequence[Row], config: RunConfig, *, source: str) -> list
     return [(began, used) for began, used in found if began < used.trainer.total_env_steps] or [(0, config)]
 
 
-def _again(run_dir: Path, config: RunConfig, stretches: Sequence[Stretch]) -> str:
+def _again(run_dir: Path, stretches: Sequence[Stretch]) -> str:
     """The command that trains a run with this `config.yaml` again, and one for each later change of its settings."""
     tables: list[dict[str, Any]] = []
     for began, used in stretches:
@@ -151,7 +151,7 @@ def _again(run_dir: Path, config: RunConfig, stretches: Sequence[Stretch]) -> st
     copy = f"{run_dir}-again"
     commands = [["train", str(run_dir / "config.yaml"), "--run-dir", copy]]
     commands += [["train", "--resume", copy] for _ in tables[1:]]
-    noted = [dotted(config)] + [tables[0]] * (len(tables) - 1)
+    noted = [dotted(load(run_dir / "config.yaml"))] + [tables[0]] * (len(tables) - 1)
     for command, before, table in zip(commands, noted, tables, strict=True):
         command += [word for key, value in changed(before, table).items() for word in (f"--{key}", _worded(value))]
     return " && ".join(plugins.command(*words) for words in commands)

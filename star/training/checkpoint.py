@@ -146,7 +146,8 @@ class Checkpoints:
 
     def config(self, step: int) -> Any:
         """The configuration inside a checkpoint."""
-        return parse(self._kind(step).migrated(self._about(step))["config"], source=str(self._path / str(step)))
+        about = self._kind(step).migrated(self._about(step))
+        return parse(about["config"], source=str(self._path / str(step)), kept=True)
 
     def restore(self, step: int, example: Any) -> Any:
         """The state saved at `step`, whatever devices it was saved on.

@@ -11,7 +11,7 @@ from typing import Any
 from envs.common import files
 from star import devices
 from star.config import plugins
-from star.config.loading import changed, dotted, load
+from star.config.loading import changed, dotted, load_run
 from star.config.run import RunConfig
 from star.config.section import ConfigError
 from star.training import checkpoint, compatibility, lock
@@ -57,7 +57,7 @@ def settings(run_dir: Path, program: Program) -> dict[str, Any]:
 
 def _noted(run_dir: Path, program: Program) -> Any:
     """The config in the folder of a run of the task of `program`."""
-    config = load(run_dir / "config.yaml")
+    config = load_run(run_dir, {})
     return program.experiment.resolve(config) if config.experiment == program.config.experiment else config
 
 

@@ -64,7 +64,7 @@ def calls(monkeypatch):
 def evaluation(run, *, env_steps):
     """A row as of `assessment.evaluate`."""
     shares = {name: 0.5 for name in ("success_any", "success_final")}
-    others = dict.fromkeys(("distance", "return", "seconds_to_goal", "path_length"), 7.0) | {"spl": None}
+    others = dict.fromkeys(("distance", "return", "seconds_to_goal", "path_length", "stayed"), 7.0) | {"spl": None}
     row = {"episodes": 8} | shares | others | {f"{name}_interval": [0.25, 0.75] for name in shares}
     about = {"run": run, "env": "point_maze", "options": {}, "engine": "jax", "env_steps": env_steps, "goals": "test"}
     return about | row | {"seeds": [{"seed": 3} | row | {"failed": [2, 5, 6, 7]}]}
@@ -300,7 +300,7 @@ def test_evaluate_prints_a_line_for_each_seed_and_how_to_watch_a_failure(calls, 
         main("evaluate runs/old --episodes 7 --checkpoint best --evaluation-seed 4 --env.options.cell 4".split()) == 0
     )
     out = capsys.readouterr().out
-    assert "3 8 0.500 [0.250, 0.750] 0.500 [0.250, 0.750] 7.0 7.0 - 7.00 2 5 6 ..." in " ".join(out.split())
+    assert "3 8 0.500 [0.250, 0.750] 0.500 [0.250, 0.750] 7.0 7.0 - 7.00 7.00 2 5 6 ..." in " ".join(out.split())
     again = "--run runs/old --checkpoint 10 --seed 3 --episode 2 --evaluation-seed 4 --episodes 7 --env.options.cell 4"
     assert f"star render {again} --out failure.html" in out
     (call,) = calls

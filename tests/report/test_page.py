@@ -12,7 +12,7 @@ from envs.common.errors import UserError
 from star.agent.growth_map import growth_map
 from star.agent.kind import STAR
 from star.cli import main
-from star.config.loading import load, parse
+from star.config.loading import load, load_run, parse
 from star.report import history, page
 
 CUTS = [0.0, 8.0, 12.0, 16.0]
@@ -76,7 +76,7 @@ def grown(run, most=page.MAX_BOXES):
 
 
 def read(folder):
-    return history.read(folder, load(folder / "config.yaml"), name=folder.name)
+    return history.read(folder, load_run(folder, {}), name=folder.name)
 
 
 def test_a_curve_is_the_mean_over_seeds_between_the_two_where_there_are_two(make):
@@ -213,6 +213,14 @@ def test_settings_changed_on_resume_are_told_and_trained_again(make, monkeypatch
     assert facts["total_env_steps"] == total
     assert [(row["env_steps"], f"--{row['key']}", row["value"]) for row in facts["changes"]] == changed
     assert facts["command"] == again
+
+
+def test_a_run_that_is_older_than_a_setting_is_trained_again_as_it_was(make, monkeypatch):
+    path = make() / "config.yaml"
+    noted = path.read_text(encoding="utf-8")
+    path.write_text(noted.replace("  straight: true\n", ""), encoding="utf-8")
+    monkeypatch.chdir(path.parent.parent)
+    assert page.facts(read(Path("run")))["command"] == f"{FIRST} --tutor.straight false"
 
 
 def test_settings_changed_on_resume_are_among_those_that_differ(make):

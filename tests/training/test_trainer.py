@@ -26,7 +26,7 @@ from envs.common.errors import UserError
 from star import cli
 from star.agent import figures
 from star.agent.migrations import FORMAT
-from star.config.loading import load, parse
+from star.config.loading import load, load_run, parse
 from star.sgim import teachers
 from star.training import checkpoint, loop, provenance, run_folder, signals, trainer
 from star.training import program as programs
@@ -289,13 +289,16 @@ def test_a_disk_that_fills_up_ends_the_run_in_one_line_and_it_resumes(finished, 
 def test_a_run_of_an_older_format_goes_on_from_its_checkpoint(name, tmp_path, capsys):
     run_dir = unpacked(name, tmp_path)
     before = rows(run_dir)
-    result = trainer.train(tiny(), run_dir, resume=True, quiet=True)
+    with pytest.raises(UserError, match="made with tutor.straight False, not True"):
+        trainer.train(tiny(), run_dir, resume=True, quiet=True)
+    config = load_run(run_dir, {"trainer.total_env_steps": 4 * EPOCH})
+    result = trainer.train(config, run_dir, resume=True, quiet=True)
     assert result.env_steps == 4 * EPOCH and capsys.readouterr().err == ""
     assert rows(run_dir)[: len(before)] == before and len(rows(run_dir)) == 2 * len(before) == 8
     assert np.isfinite([row["controller/critic_loss"] for row in rows(run_dir)]).all()
     about = json.loads((run_dir / "checkpoints" / str(4 * EPOCH) / "about.json").read_text())
     assert about["format"] == FORMAT
-    saved_state(tiny(), run_dir)
+    saved_state(config, run_dir)
 
 
 def test_what_sgim_has_chosen_is_written_down(finished):
@@ -608,7 +611,7 @@ def test_a_checkout_that_is_not_installed_says_where_it_runs_all_the_same(monkey
 
 
 def test_another_config_than_that_of_the_folder_is_refused_before_anything_is_written(tmp_path):
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(TINY), encoding="utf-8")
+    (tmp_path / "config.yaml").write_text(tiny().to_yaml(), encoding="utf-8")
     with pytest.raises(UserError, match="was begun with trainer.num_envs"):
         trainer.train(tiny(trainer__num_envs=6), tmp_path, resume=True, quiet=True)
     assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
