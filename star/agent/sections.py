@@ -90,7 +90,7 @@ class TutorConfig(LevelConfig):
     )
     unroll: Positive = Field(5, description="decisions of each environment per update")
     reward_scale: float = Field(0.3, gt=0, description="factor on the reward")
-    straight: bool = Field(True, description="aim straight at a target box that lies within reach of one subgoal")
+    straight: bool = Field(True, description="aim straight at the box around a goal within half the reach of a subgoal")
     relative_bounds: bool = Field(True, description="observe the region's bounds relative to the agent")
     off_policy_correction: bool = Field(False, description="relabel replayed subgoals (HIRO); needs learner td3")
     correction_candidates: Batch = Field(10, description="random candidates of the off-policy correction")

@@ -8,9 +8,8 @@
     act         once a segment
     experience  the segment, as one transition; it learns from `unroll` of them at a time
 
-A target box that lies within reach of one subgoal needs none on the way to it: with `straight` its centre is the
-subgoal, in training and in greedy episodes, and of these decisions nothing is learnt. So agents stay where they were
-sent to.
+The box around a goal that is close needs no subgoal on the way to it: with `straight` its centre is the subgoal, in
+training and in greedy episodes, and of these decisions nothing is learnt. So agents stay at goals.
 
 Where SGIM says so, a teacher sets the subgoal, straight ahead to his waypoint, which the Tutor imitates; or it is
 random, of which the Tutor learns nothing.
@@ -36,6 +35,8 @@ from star.learners.replay import Imitation, Penalty, Transition, flatten
 from star.sgim.lessons import Marks
 
 Metrics = dict[str, Array]
+
+CLOSE = 0.5  # of the farthest subgoal in each dimension: the Controller gets there within a decision or two
 
 
 class Trace(struct.PyTreeNode):
@@ -96,7 +97,7 @@ def act(
     seen = observe(section, task, obs, box)
     action = learners.act(section, state, seen, deterministic=not explore, key=key)
     if section.straight:
-        action = jnp.where(within_reach(task, obs, box)[:, None], _straight(task, obs, box.centre), action)
+        action = jnp.where(stands_close(task, obs, box)[:, None], _straight(task, obs, box.centre), action)
     if marks.way is not None and marks.way.led is not None:
         action = jnp.where(marks.way.led[:, None], _straight(task, obs, marks.way.point), action)
     if marks.own is not None:
@@ -105,10 +106,12 @@ def act(
     return Choice(subgoal=subgoal(action, task.spec.scale), seen=seen, action=action)
 
 
-def within_reach(task: Task, obs: Float[Array, "*batch obs"], box: Box) -> Bool[Array, "*batch"]:
-    """Where every point of `box` is one that a subgoal can be set to."""
-    farthest = jnp.abs(box.centre - task.spec.abstract(obs)) + (box.upper - box.lower) / 2
-    return jnp.all(farthest <= task.spec.scale[: farthest.shape[-1]], axis=-1)
+def stands_close(task: Task, obs: Float[Array, "*batch obs"], box: Box) -> Bool[Array, "*batch"]:
+    """Where `box` is no larger than one around a goal, and wholly within half the reach of a subgoal."""
+    half = (box.upper - box.lower) / 2
+    small = (half <= 1.01 * task.goal_margin) | ~task.spec.in_goal()  # its corners were rounded
+    farthest = jnp.abs(box.centre - task.spec.abstract(obs)) + half
+    return jnp.all(small & (farthest <= CLOSE * task.spec.scale[: farthest.shape[-1]]), axis=-1)
 
 
 def _straight(task: Task, obs: Float[Array, "*batch obs"], point: Float[Array, "*batch d"]) -> Float[Array, "*batch p"]:
@@ -137,7 +140,7 @@ def experience(
         extras = Trace(states=states, actions=actions, achieved=path)
     weight = jnp.ones_like(lost)
     if section.straight:
-        weight *= ~within_reach(task, segment.obs[0], segment.box)
+        weight *= ~stands_close(task, segment.obs[0], segment.box)
     if marks.own is not None:
         weight *= marks.own
     if marks.led is not None:  # somebody else's, to be imitated

@@ -23,23 +23,29 @@ def settings(**values):
     return loading.parse({"tutor": values}).tutor
 
 
+def task(indices=(0, 1), *, state_dim=3, radius=1.0, reach=None):
+    """What the Tutor knows of a task whose abstract dimensions are those of its goals."""
+    d = len(indices)
+    spec = Spec(
+        state_dim=state_dim,
+        action_size=1,
+        episode_length=1,
+        abstract_indices=indices,
+        goal_indices=indices,
+        subgoal_scale=reach or (1.0,) * d,
+        space=((0.0,) * d, (90.0,) * d),
+        region_cuts=((),) * d,
+        success_radius=radius,
+    )
+    return Task.of(loading.parse({}), spec)
+
+
 @pytest.mark.parametrize("relative", [True, False])
 def test_it_sees_the_state_and_the_bounds_of_the_box(relative):
     state, here = jnp.array([[1.0, 2.0, 7.0]]), jnp.array([[1.0, 2.0]])
     box = Box(lower=jnp.array([[4.0, 4.0]]), upper=jnp.array([[8.0, 10.0]]))
-    spec = Spec(
-        state_dim=3,
-        action_size=1,
-        episode_length=1,
-        abstract_indices=(0, 1),
-        goal_indices=(0, 1),
-        subgoal_scale=(1.0, 1.0),
-        space=((0.0, 0.0), (9.0, 9.0)),
-        region_cuts=((), ()),
-        success_radius=1.0,
-    )
     obs = jnp.concatenate([state, 9 + here], axis=-1)  # the goal comes last, and is not seen
-    seen = tutor.observe(settings(relative_bounds=relative), Task.of(loading.parse({}), spec), obs, box)
+    seen = tutor.observe(settings(relative_bounds=relative), task(), obs, box)
     bounds = [3, 2, 7, 8] if relative else [4, 4, 8, 10]
     np.testing.assert_array_equal(seen, [[1, 2, 7, *bounds]])
     np.testing.assert_array_equal(box.centre, [[6, 7]])
@@ -48,46 +54,23 @@ def test_it_sees_the_state_and_the_bounds_of_the_box(relative):
 @pytest.mark.parametrize("radius", [0.1, 0.5, 1.0, 5.0, 40.0])
 @pytest.mark.parametrize("indices", [(0,), (0, 1), (0, 1, 2)])
 def test_whoever_is_in_the_box_around_a_goal_has_reached_it(radius, indices):
-    spec = Spec(
-        state_dim=4,
-        action_size=1,
-        episode_length=1,
-        abstract_indices=indices,
-        goal_indices=indices,
-        subgoal_scale=(1.0,) * len(indices),
-        space=((0.0,) * len(indices), (9.0,) * len(indices)),
-        region_cuts=((),) * len(indices),
-        success_radius=radius,
-    )
     goal = np.full((1, len(indices)), 3.0)
-    box = Task.of(loading.parse({}), spec).goal_box(goal)
+    box = task(indices, state_dim=4, radius=radius).goal_box(goal)
     corner = np.linalg.norm(box.upper - goal)
     assert corner <= 0.7 * radius + 1e-5
     assert (box.upper - goal).max() == pytest.approx(min(1.0, 0.7 * radius / len(indices) ** 0.5), abs=1e-5, rel=1e-4)
 
 
 @pytest.mark.parametrize("straight", [True, False])
-def test_a_box_within_reach_is_aimed_at_and_teaches_nothing(straight):
-    """The first box lies within reach of (10, 5), the second sticks out of it, the third is far away."""
-    section = settings(straight=straight, ppo={"hidden": [4]})
-    spec = Spec(
-        state_dim=3,
-        action_size=1,
-        episode_length=1,
-        abstract_indices=(0, 1),
-        goal_indices=(0, 1),
-        subgoal_scale=(10.0, 5.0),
-        space=((0.0, 0.0), (90.0, 90.0)),
-        region_cuts=((), ()),
-        success_radius=1.0,
-    )
-    task = Task.of(loading.parse({}), spec)
+def test_a_box_around_a_goal_close_by_is_aimed_at_and_teaches_nothing(straight):
+    """Half of the reach of (10, 5): the second box sticks out of it, the third is larger than one around a goal."""
+    section, known = settings(straight=straight, ppo={"hidden": [4]}), task(reach=(10.0, 5.0))
+    margin = float(known.goal_margin)
     obs = jnp.tile(jnp.array([1.0, 2.0, 7.0, 0.0, 0.0]), (3, 1))
-    box = Box(
-        lower=jnp.array([[5.0, 4.0], [5.0, 4.0], [50.0, 4.0]]), upper=jnp.array([[7.0, 6.0], [7.0, 8.0], [52.0, 6.0]])
-    )
-    state, marks = tutor.init(jax.random.key(0), section, task), Marks()
-    choice = tutor.act(section, task, state, obs, box, marks, explore=True, key=jax.random.key(1))
+    centre = jnp.array([[5.0, 3.0], [5.0, 4.1], [5.0, 3.0]])
+    box = Box.around(centre, jnp.array([[margin], [margin], [1.2 * margin]]))
+    state, marks = tutor.init(jax.random.key(0), section, known), Marks()
+    choice = tutor.act(section, known, state, obs, box, marks, explore=True, key=jax.random.key(1))
     aimed = np.linalg.norm(choice.subgoal - (box.centre - obs[:, :2]), axis=1) < 1e-6
     assert aimed.tolist() == [straight, False, False]
     steps = jnp.zeros((L, 3))
@@ -95,7 +78,7 @@ def test_a_box_within_reach_is_aimed_at_and_teaches_nothing(straight):
         obs=jnp.stack([obs] * (L + 1)), seen=(), subgoal=(), action=steps, terminated=steps, ended=steps, success=steps,
         distance=steps, alive=steps + 1, non_finite=steps, overflow=steps, box=box, choice=choice,
     )  # fmt: skip
-    learnt = tutor.experience(section, task, passed, marks, renewed=jnp.zeros(3, bool))
+    learnt = tutor.experience(section, known, passed, marks, renewed=jnp.zeros(3, bool))
     np.testing.assert_array_equal(learnt.weight, [0.0 if straight else 1.0, 1.0, 1.0])
 
 
