@@ -156,9 +156,10 @@ def test_the_tutors_chain_is_cut_where_the_target_or_the_episode_ends(recording)
         assert recording.tutor.cut[i, b] == (recording.before.memory.clock[i, b] == K - L or ended(recording, i, b))
     box, position = recording.passed.box, recording.spec.abstract(recording.passed.obs[:, 0])
     farthest = np.maximum(np.abs(box.lower - position), np.abs(box.upper - position))
-    near = (farthest <= recording.spec.subgoal_scale).all(axis=-1)
-    assert near.any() and not near.all()
-    np.testing.assert_array_equal(recording.tutor.weight, 1 if recording.published else ~near)
+    small = ((box.upper - box.lower) / 2 <= 1.0 + 1e-3).all(axis=-1)  # the goal's margin
+    close = small & (farthest <= np.array(recording.spec.subgoal_scale) / 2).all(axis=-1)
+    assert close.any() and not close.all()
+    np.testing.assert_array_equal(recording.tutor.weight, 1 if recording.published else ~close)
 
 
 class Epoch:
