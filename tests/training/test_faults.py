@@ -280,9 +280,10 @@ def test_the_command_says_in_one_line_what_was_lost_and_how_to_go_on(
     fault = faults.Fault(480, {6: {"tutor/params/a": 1, "tutor/params/b": 2, "controller/q": 1}})
     result = trainer.Result(tmp_path / "run", 480, False, None, fault=fault, saved=saved)
     monkeypatch.setattr(trainer, "train", lambda *args, **kwargs: result)
-    (tmp_path / "config.yaml").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").write_text("{}")
     flags = [word for key, value in policy.items() for word in (f"--{key}", value)]
-    assert cli.main(["train", str(tmp_path / "config.yaml"), *flags]) == 3
+    assert cli.main(["train", "config.yaml", *flags]) == 3
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(
         "stopped: not finite after 480 env steps: seed 6: tutor/params/a and 1 more of it, controller/q; "
@@ -294,8 +295,9 @@ def test_debug_turns_the_checks_on_with_and_without_goal_selection(tmp_path, mon
     turned_on = []
     monkeypatch.setattr(debugging, "turn_on", lambda: turned_on.append(True))
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
-    (tmp_path / "config.yaml").write_text("{}")
-    command = ["train", str(tmp_path / "config.yaml"), "--debug"]
+    monkeypatch.chdir(tmp_path)
+    Path("config.yaml").write_text("{}")
+    command = ["train", "config.yaml", "--debug"]
     assert cli.main(command) == 0 and turned_on == [True]
     assert cli.main([*command, "--sgim.goals", "true"]) == 0 and turned_on == [True, True]
 
