@@ -366,6 +366,26 @@ def test_each_layer_changes_a_setting_of_the_task_on_which_it_is_compared(name):
     assert loading.load(task, row.settings, layers=layers) != without
 
 
+@pytest.mark.parametrize(("fails", "code"), [(False, 0), (True, 1)])
+def test_the_check_of_learning_goes_on_where_a_layer_is_new_or_a_command_fails(
+    tmp_path, monkeypatch, capsys, fails, code
+):
+    def compare(old, new, name, place):
+        if fails and name == "agents/gara":
+            raise RuntimeError("its last words")
+        return CHECK.Found("same")
+
+    monkeypatch.setattr(CHECK, "compare", compare)
+    (tmp_path / "configs" / "agents").mkdir(parents=True)
+    for name in ("gara", "flat"):
+        (tmp_path / "configs" / "agents" / f"{name}.yaml").touch()
+    names = ["agents/gara", "agents/flat", "agents/hiro"]
+    assert CHECK.compared(tmp_path, tmp_path, names, CHECK.Place(tmp_path, tmp_path), jobs=1) == code
+    told = capsys.readouterr().out
+    assert f"{2 - fails} same, 0 close, 0 differs, {int(fails)} fails, 1 new" in told
+    assert ("its last words" in told) == fails
+
+
 def test_the_check_of_learning_tells_a_bit_from_rounding_and_rounding_from_more():
     whole, real = np.arange(3), np.array([1.0, 1e-3, np.nan], np.float32)
     old = {"count": whole, "weight": real}

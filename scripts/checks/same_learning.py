@@ -9,14 +9,15 @@ and resumed, and the metrics within 1e-6 of one another.
 
 Where they are not, both have to start alike, and NEW trains one epoch from each of OLD's checkpoints after 0, 2 and 4
 epochs: whole numbers have to be equal, the others within 1e-5 of the largest of their leaf. Such a row is `close`, and
-wants a reason in the commit.
+wants a reason in the commit. A layer that OLD does not have is `new`, and not compared. Where a command fails the row
+says `fails`, and the others go on.
 
 Both checkouts run in the same Python on the same machine: rounding depends on the processor. They are compiled in
 haste unless XLA_FLAGS says how. `--keep` keeps the runs of OLD and what was compiled, for the next comparison with the
 same OLD. With `--plant` OLD is compared with itself, once with two random keys swapped and once with one weight
 changed, and both have to be found.
 
-Exit code: 0 if all rows are the same or close (with --plant: if both plants were found), 1 if not.
+Exit code: 0 if no row differs or fails (with --plant: if both plants were found), 1 if not.
 """
 
 from __future__ import annotations
@@ -160,6 +161,9 @@ ROWS: dict[str, Row] = {
 }
 
 
+VERDICTS = ("same", "close", "differs", "fails", "new")
+
+
 class Place(NamedTuple):
     """Where runs are written, and where those of OLD and what was compiled may stay."""
 
@@ -168,7 +172,7 @@ class Place(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a comparison found: `same`, `close` or `differs`, the first thing that does, and how many cuts OLD made."""
+    """What a comparison found: one of `VERDICTS`, the first thing that differs, and how many cuts OLD made."""
 
     verdict: str
     detail: str = ""
@@ -200,15 +204,25 @@ def compared(old: Path, new: Path, names: list[str], place: Place, *, jobs: int)
     """Compare the rows `names` and print what was found."""
     table = Table("layer", "verdict", "cuts", "first difference")
     with ThreadPoolExecutor(jobs) as pool:
-        futures = [pool.submit(compare, old, new, name, place) for name in names]
+        futures = [pool.submit(tried, old, new, name, place) for name in names]
         console = Console(stderr=True)
         found = [future.result() for future in track(futures, "comparing", console=console, transient=True)]
     for name, each in zip(names, found, strict=True):
         table.add_row(name, each.verdict, str(each.splits), each.detail)
     Console(width=160).print(table)
-    count = {verdict: sum(each.verdict == verdict for each in found) for verdict in ("same", "close", "differs")}
+    count = {verdict: sum(each.verdict == verdict for each in found) for verdict in VERDICTS}
     print(", ".join(f"{number} {verdict}" for verdict, number in count.items()))
-    return int(count["differs"] > 0)
+    return int(count["differs"] + count["fails"] > 0)
+
+
+def tried(old: Path, new: Path, name: str, place: Place) -> Found:
+    """`compare`, for layers that OLD may not have and commands that may fail."""
+    if not (old / "configs" / f"{name}.yaml").exists():
+        return Found("new")
+    try:
+        return compare(old, new, name, place)
+    except RuntimeError as error:
+        return Found("fails", str(error))
 
 
 def planted(old: Path, place: Place) -> int:
