@@ -28,6 +28,8 @@ from star.spec import Spec
 
 Metrics = dict[str, Array]
 
+_CELLS = 32  # of the grid on which ground is counted, along each dimension
+
 
 def learn(
     config: AgentConfig,
@@ -52,6 +54,7 @@ def learn(
         f"commander/{k}": x for k, x in commander.measure(section, state.commander, roadmap, finished[0]).items()
     }
     periods = num_envs * (spec.episode_length // section.period)
+    metrics["commander/ground"] = _ground(spec, finished.outcome)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
     goals = Goals.of(outcome, decision.at_goal, cube=spec.cube)
     state, more = _learn_where_commands_lead(config, state, decision, outcome, key=train_key)
@@ -122,6 +125,15 @@ def _learn_where_commands_lead(
     return state.replace(forward_model=model, graph=graph), {
         f"forward_model/{name}": value for name, value in metrics.items()
     }
+
+
+def _ground(spec: Spec, outcome: Outcome) -> Array:
+    """The share of the cells of a grid over the first two dimensions of the space in which periods ended."""
+    lower, upper = (jnp.asarray(corner)[:2] for corner in spec.space)
+    share = (outcome.end[..., :2] - lower) / (upper - lower)
+    cells = jnp.clip(jnp.floor(_CELLS * share), 0, _CELLS - 1).astype(jnp.int32)
+    occupied = jnp.zeros((_CELLS,) * len(lower)).at[tuple(jnp.moveaxis(cells, -1, 0))].max(outcome.weight)
+    return jnp.mean(occupied > 0)
 
 
 def _complete(finished: Finished, size: int, *, key: Array) -> Finished:

@@ -6,9 +6,10 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
+from star.agent import notices
 from star.agent.migrations import FORMAT, TO_NEXT
 from star.agent.sections import Config
-from star.config.kinds import Kind, Measure
+from star.config.kinds import Kind, Measure, Notices
 
 
 def _lazily(module: str, name: str) -> Callable[..., Any]:
@@ -33,6 +34,7 @@ STAR = Kind(
     row={"lower": list, "upper": list, "chosen": list},
     # not known yet; what the environment has repaired
     may_be_nan=("graph/error", "sgim/mean", "env/non_finite"),
+    notices=Notices(notices.KEYS, notices.notices),
     levels={
         "commander": ("commander/reward", None, "commander/td_error"),
         "tutor": ("tutor/reward", "tutor/actor_loss", "tutor/critic_loss"),

@@ -585,6 +585,7 @@ function provenance() {
     ["packages", run => [...new Set(run.facts.starts.map(({ versions }) =>
       Object.entries(versions).map(([name, version]) => `${name} ${version}`).join(", ")))].join("; ")],
     ...(runs.some(run => run.facts.changes.length) ? [["changed on resume", changed]] : []),
+    ...(runs.some(run => run.facts.notices.length) ? [["notes", run => run.facts.notices.join("; ") || "none"]] : []),
     ["the same again", run => html("code", {}, run.facts.command)],
   ];
   const rows = facts.map(([name, cell]) => [name, ...runs.map(run => cell(run) || "not recorded")]);

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -61,6 +61,15 @@ class Migration:
     arrays: Callable[[Arrays], Arrays] = lambda arrays: arrays
 
 
+class Notices(NamedTuple):
+    """What a person should know of a run while it goes on, and when it is over."""
+
+    keys: tuple[str, ...] = ()
+    """The metrics that it is drawn from."""
+    lines: Callable[[Sequence[Mapping[str, Any]]], Mapping[str, str]] = lambda rows: {}
+    """From the rows of one seed so far, of which only `env_steps` and the `keys` are read: lines by their subjects."""
+
+
 class Kind(NamedTuple):
     """A kind of experiment."""
 
@@ -82,6 +91,8 @@ class Kind(NamedTuple):
     """The keys of such a row, and what their values are."""
     may_be_nan: tuple[str, ...] = ()
     """Names of parts of the state that may be NaN or infinite, and of metrics that count what is no fault."""
+    notices: Notices = Notices()
+    """What is said once of each seed and subject, and shown in the report."""
     levels: Mapping[str, tuple[str | None, str | None, str | None]] = {}
     """Rows of the console: the metrics of reward, actor loss and critic loss of each level."""
     format: int = 1

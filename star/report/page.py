@@ -116,7 +116,15 @@ def facts(run: Run) -> dict[str, Any]:
         "starts": run.starts,
         "changes": history.changes(run),
         "measured": measured,
+        "notices": notices(run),
     }
+
+
+def notices(run: Run) -> list[str]:
+    """What a person should know of each seed."""
+    lines = kinds.of(run.config).notices.lines
+    found = {seed: lines([row for rows in run.epochs for row in rows if row["seed"] == seed]) for seed in run.seeds}
+    return [f"seed {seed}: {line}" for seed, of_seed in found.items() for line in of_seed.values()]
 
 
 def _episodes(measure: Measure, config: RunConfig) -> int | None:

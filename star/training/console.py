@@ -125,6 +125,11 @@ class Display:
         """Print one line, above the view if there is one; from any thread."""
         self._console.print(line, style=style, highlight=False, markup=False, soft_wrap=True)
 
+    def note(self, line: str) -> None:
+        """Print one line that people want to know, unless they want quiet."""
+        if not self._quiet:
+            self.say(f"note: {line}")
+
     def warn(self, line: str) -> None:
         """Print one line that is worth notice, quiet or not."""
         self.say(f"warning: {line}", style="yellow")

@@ -68,6 +68,9 @@ class Loop:
         self._spare: tuple[int, Any] | None = None
         """(epochs, state) before what may take long."""
         self._stop = stop
+        self._seen: dict[int, list[dict[str, Any]]] = {seed: [] for seed in program.seeds}
+        """Of each seed what notices are drawn from, since this process began."""
+        self._noted: set[tuple[int, str]] = set()
         self._stopwatch = Stopwatch()
         self._display = Display(
             console,
@@ -117,6 +120,7 @@ class Loop:
             state, table, fault = self._epoch(state)
             others.write(table)
             self._display.update(self._env_steps, table, left_s=self._stopwatch.left(_left(program, self._done)))
+            self._note(table)
             if fault is None and self._is_due(program.config.trainer.checkpoint_every, self._done):
                 with self._stopwatch.measure("checkpoint"):
                     self._save(self._done, state)
@@ -143,6 +147,17 @@ class Loop:
             self._recorder.add_tables(state, env_steps=self._env_steps)
         self._recorder.add(table, env_steps=self._env_steps, speed=speed)
         return state, table, fault
+
+    def _note(self, table: list[dict[str, Any]]) -> None:
+        """Say what is new to say of each seed."""
+        notices = self._program.kind.notices
+        for row in table:
+            seed, rows = row["seed"], self._seen[row["seed"]]
+            rows.append({key: row[key] for key in ("env_steps", *notices.keys) if key in row})
+            for subject, line in notices.lines(rows).items():
+                if (seed, subject) not in self._noted:
+                    self._noted.add((seed, subject))
+                    self._display.note(f"seed {seed}: {line}")
 
     def _compute(self, state: Any) -> tuple[Any, list[dict[str, Any]]]:
         state, metrics = self._program.epoch(state)

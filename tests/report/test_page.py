@@ -125,6 +125,13 @@ def test_of_a_run_that_goes_on_only_what_is_complete_is_shown(make):
     assert (facts["env_steps"], facts["total_env_steps"], facts["wall_s"]) == (300, 400, 6.0)
 
 
+def test_what_there_is_to_note_of_a_seed_is_among_the_facts(make):
+    full = [row | {"refinement/table_full": int(row["seed"] == 1 and row["env_steps"] >= 200)} for row in metrics(4, (0, 1))]
+    found = page.facts(read(make(rows=[row | {"abstraction/regions": 9} for row in full])))["notices"]
+    assert len(found) == 1 and found[0].startswith("seed 1: the table of regions is full, 9 since 200 env steps")
+    assert page.facts(read(make("other")))["notices"] == []
+
+
 def test_regions_that_only_some_seeds_have_written_yet_are_left_out(make):
     rows = [{"seed": seed, "env_steps": n} | strip(1) for n, seed in ((200, 0), (200, 1), (400, 0))]
     assert [row["env_steps"] for row in read(make("a", regions=rows)).tables] == [200, 200]

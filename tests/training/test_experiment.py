@@ -24,11 +24,14 @@ PAGE = Path(__file__).parents[2] / "docs" / "experiments.md"
 # The same with a measure where less is better, and seeds that share a counter.
 CLOSER = """
 from bandit import *
+from star.config.kinds import Notices
 
 CLOSER = KIND._replace(measures=KIND.measures[::-1], in_step=True)
 PARTS = KIND._replace(build=lambda config: Parts(config))
 NOTHING = KIND._replace(measures=())
 OTHER = KIND._replace(Config=Learning)
+LATE = Notices(("bandit/error",), lambda rows: {"late": f"{sorted(rows[-1])} since {len(rows)}"} if len(rows) > 6 else {})
+NOTED = KIND._replace(notices=LATE)
 
 
 class Parts(Experiment):
@@ -63,6 +66,15 @@ def trained(run, *words, config="run.yaml"):
 def arrays(run, step):
     with opened(Path(run)) as checkpoints:
         return checkpoints.arrays(step)
+
+
+def test_what_there_is_to_note_is_said_once_of_each_seed_unless_quiet_is_wanted(here, capsys):
+    (here / "noted.yaml").write_text((here / "run.yaml").read_text().replace("bandit:KIND", "closer:NOTED"))
+    trained("quiet", config="noted.yaml")
+    assert "note:" not in "".join(capsys.readouterr())
+    assert main(["train", "noted.yaml", "--run-dir", "told"]) == 0
+    lines = [line for line in "".join(capsys.readouterr()).splitlines() if line.startswith("note:")]
+    assert lines == [f"note: seed {seed}: ['bandit/error', 'env_steps'] since 7" for seed in range(5)]
 
 
 def test_it_trains_and_goes_on_bit_for_bit(here):

@@ -1,0 +1,35 @@
+"""What a run lacks, in one line each: room for regions, or new ground.
+
+Drawn from rows of metrics alone, so that a run says it while it goes on, and the report afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+PATIENCE = 10  # epochs without new ground
+ENOUGH = 0.5  # success_final of agents that need none
+KEYS = ("abstraction/regions", "refinement/table_full", "commander/ground", "eval/success_final")
+_SHARE = 0.95  # of the most ground in an epoch: what is less than that beyond it is luck
+_EVALUATIONS = 3
+
+
+def notices(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """What the rows of one seed so far say, by what it is about; the rows have `env_steps` and those of `KEYS`."""
+    found = {}
+    full = next((row for row in rows if row.get("refinement/table_full") == 1), None)
+    if full is not None:
+        found["room"] = (
+            f"the table of regions is full, {full['abstraction/regions']:.0f} since {full['env_steps']:,} env steps; "
+            "abstraction.max_regions makes room"
+        )
+    success = [row["eval/success_final"] for row in rows if row.get("eval/success_final") is not None]
+    ground = [row.get("commander/ground") for row in rows]
+    if len(success) >= _EVALUATIONS and max(success[-_EVALUATIONS:]) < ENOUGH and None not in ground:
+        since = next(i for i, share in enumerate(ground) if share >= _SHARE * max(ground))
+        if len(rows) - 1 - since >= PATIENCE:
+            found["frontier"] = (
+                f"no new ground since {rows[since]['env_steps']:,} env steps, and success_final is below {ENOUGH:g}"
+            )
+    return found
