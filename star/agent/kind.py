@@ -27,6 +27,7 @@ STAR = Kind(
     measures=(
         Measure("success_final", label="success at the last step", where="on test goals", episodes=_episodes),
         Measure("success_any", label="success at any step", where="on test goals", episodes=_episodes),
+        Measure("time_at_goal", label="env steps at the goal", where="on test goals"),
     ),
     title=lambda config: config.env.name,
     unit="env steps",

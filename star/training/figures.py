@@ -15,6 +15,7 @@ from star.config.run import RunConfig
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 Row = Mapping[str, Any]
 
@@ -32,24 +33,37 @@ def measures_figure(rows: Sequence[Row], config: RunConfig) -> Figure:
 
 
 def draw_measures(axis: Axes, rows: Sequence[Row], measures: Sequence[Measure], *, unit: str) -> None:
-    """The measures over env steps, means over seeds, with the range between seeds."""
+    """The measures over env steps, means over seeds, with the range between seeds.
+
+    Beside shares of episodes others have an axis of their own, on the right.
+    """
+    shares = [measure for measure in measures if measure.episodes]
+    others = [one for one in measures if not one.episodes and any(row.get(one.key) is not None for row in rows)]
+    beside = axis.twinx() if shares and others else axis
+    lines: list[Line2D] = []
     for measure, style in zip(measures, _STYLES * len(measures), strict=False):
+        own = axis if measure.episodes else beside
         evaluated = [row for row in rows if row.get(measure.key) is not None]
         steps = sorted({row["env_steps"] for row in evaluated})
         curves = [[row[measure.key] for row in evaluated if row["env_steps"] == step] for step in steps]
         if not curves:
             continue
         label = literal(measure.name.replace("_", " "))
-        (line,) = axis.plot(steps, [np.mean(c) for c in curves], style, marker=".", label=label)
+        colour = f"C{len(lines)}"
+        (line,) = own.plot(steps, [np.mean(c) for c in curves], style, marker=".", label=label, color=colour)
+        lines.append(line)
         low, high = [np.min(c) for c in curves], [np.max(c) for c in curves]
-        axis.fill_between(steps, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+        own.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
     axis.set_xlabel(unit)
     axis.set_ylabel(f"evaluation {measures[0].where}".rstrip())
-    if all(measure.episodes for measure in measures):
+    if shares:
         axis.set_ylim(-0.02, 1.02)
+    if beside is not axis:
+        beside.set_ylabel(", ".join(measure.label or literal(measure.name) for measure in others))
+        beside.set_ylim(bottom=0)
     axis.grid(alpha=0.3)
-    if axis.lines:  # none before the first evaluation
-        axis.legend(loc="lower right")
+    if lines:  # none before the first evaluation
+        beside.legend(handles=lines, loc="lower right")
 
 
 def save(figure: Figure, path: Path) -> None:
