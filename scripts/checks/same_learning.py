@@ -133,6 +133,7 @@ ROWS: dict[str, Row] = {
     "agents/hrac": Row(settings=POINT | ADJACENCY),
     "ablations/grid": Row(),
     "ablations/no_heading": Row("ant_maze_cam", ANT),
+    "ablations/no_doubts": Row(),
     "ablations/no_mask": Row(),
     "ablations/no_practice": Row(),
     "ablations/no_refinement": Row(),

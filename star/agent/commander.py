@@ -76,7 +76,7 @@ def begin(section: CommanderConfig, position: Float[Array, "B d"], *, decisions:
     """
     memory = blank(position)
     if decisions is not None:
-        return memory.replace(past=jnp.full((len(position), decisions, 2), -1))
+        return memory.replace(past=jnp.full((len(position), decisions, 3), -1))
     practising = jax.random.uniform(key, (len(position),)) < section.practice
     return memory.replace(practice=jnp.where(practising, ANY, -1))
 
@@ -117,8 +117,8 @@ def command(
     practice = jnp.where((memory.practice == region) | (memory.practice == ANY), another, memory.practice)
     past, worth = memory.past, None
     if past is not None:
-        past, tries = _remembered(memory, past, region, regions=roadmap.abstraction.capacity)
-        worth = section.retry**tries
+        past = _remembered(memory, past, region, scene.success)
+        worth = _worth_by_now(section, state, past, region, goal_region)
     target = values.choose(
         state,
         roadmap.allowed,
@@ -160,16 +160,36 @@ def _shares(
 
 
 def _remembered(
-    memory: Memory, past: Int[Array, "B N 2"], region: Int[Array, "B"], *, regions: int
-) -> tuple[Int[Array, "B N 2"], Float[Array, "B R"]]:
-    """`past` by now, and how often `region` was left under each of the commands.
+    memory: Memory, past: Int[Array, "B N 3"], region: Int[Array, "B"], success: Float[Array, "B"]
+) -> Int[Array, "B N 3"]:
+    """`past` with the last decision, unless the agent stays where it succeeds."""
+    left = region != memory.region
+    last = jnp.stack([memory.region, memory.target, left.astype(past.dtype)], axis=-1)
+    return where(left | (success == 0), jnp.concatenate([past[:, 1:], last[:, None]], axis=1), past)
 
-    All in vain, as the agent is there again. The last decision is past where the agent is in another region.
+
+def _worth_by_now(
+    section: CommanderConfig,
+    state: CommanderState,
+    past: Int[Array, "B N 3"],
+    region: Int[Array, "B"],
+    goal_region: Int[Array, "B"],
+) -> Float[Array, "B R"]:
+    """What is left of the value of each command in `region`, from 0 to 1, after what it did in this episode.
+
+    Where it led out, that was in vain, as the agent is there again: `retry` for each time. Where it did not, that was
+    bad luck, of a known chance s each time, or the command does not work from here. With `trust` = h, the chance that
+    it does after n times, over h, is s^n / (h s^n + 1 - h) (Bayes).
     """
-    last = jnp.stack([memory.region, memory.target], axis=-1)
-    past = where(region != memory.region, jnp.concatenate([past[:, 1:], last[:, None]], axis=1), past)
-    again = (past[..., 0] == region[:, None]).astype(jnp.float32)
-    return past, jax.vmap(lambda target, weight: jnp.zeros(regions).at[target].add(weight))(past[..., 1], again)
+    again = past[..., 0] == region[:, None]
+
+    def number(which: Bool[Array, "B N"]) -> Float[Array, "B R"]:
+        count = lambda target, weight: jnp.zeros(state.chosen.shape).at[target].add(weight)  # noqa: E731
+        return jax.vmap(count)(past[..., 1], which.astype(jnp.float32))
+
+    left, stayed = number(again & (past[..., 2] == 1)), number(again & (past[..., 2] == 0))
+    luck = jnp.maximum(_rule(section).staying(section, state, region, goal_region) ** stayed, 1e-30)
+    return section.retry**left * luck / (section.trust * luck + 1 - section.trust)
 
 
 def experience(

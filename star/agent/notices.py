@@ -25,8 +25,8 @@ def notices(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
             "abstraction.max_regions makes room"
         )
     success = [row["eval/success_final"] for row in rows if row.get("eval/success_final") is not None]
-    ground = [row.get("commander/ground") for row in rows]
-    if len(success) >= _EVALUATIONS and max(success[-_EVALUATIONS:]) < ENOUGH and None not in ground:
+    ground = [row["commander/ground"] for row in rows if row.get("commander/ground") is not None]
+    if len(success) >= _EVALUATIONS and max(success[-_EVALUATIONS:]) < ENOUGH and len(ground) == len(rows):
         since = next(i for i, share in enumerate(ground) if share >= _SHARE * max(ground))
         if len(rows) - 1 - since >= PATIENCE:
             found["frontier"] = (

@@ -34,6 +34,7 @@ from star.agent.values import CommanderState, Model, best
 
 _HUNCH = 0.1  # what belief is worth where nothing is to be tried
 _HABIT = 0.1  # share by which a command that nobody follows has to be better than the usual one
+_KEPT = 20.0  # decisions of a command that do not fade, since rare ones would be forgotten before they are enough
 
 
 def init(*, regions: int) -> Model:
@@ -95,10 +96,35 @@ def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *,
     return state.replace(q=q * (1 - _HABIT * (1 - usual)))
 
 
+def staying(
+    section: CommanderConfig, state: CommanderState, region: Int[Array, "B"], goal_region: Int[Array, "B"]
+) -> Float[Array, "B R"]:
+    """Chance that a command does not lead out of `region`, and of the goal in it, that it is not reached.
+
+    By what was counted, and `section.prior` decisions of which half do not.
+    """
+    model, each = _model(state), jnp.arange(len(region))
+    led, lost = model.led[:, region], model.lost[:, region]
+    stays = led[:, each, :, region].swapaxes(0, 1)
+    to_region, to_goal = (stays + section.prior / 2) / (led.sum(axis=-1) + lost + section.prior)
+    targets = jnp.arange(to_region.shape[-1])
+    reward = model.rewards[region, goal_region] + section.prior / 2
+    missed = jnp.clip(1 - reward / (model.visits[region, goal_region] + section.prior), 0.0, 1.0)
+    at_goal = targets == goal_region[:, None]
+    return jnp.where(at_goal, jnp.where(targets == region[:, None], missed, to_goal), to_region)
+
+
 def fade(section: CommanderConfig, state: CommanderState) -> Model:
-    """Let one epoch pass: the lower levels have learnt, so old decisions count less."""
+    """Let one epoch pass: the lower levels have learnt, so old decisions count less, but for the last `_KEPT`."""
     model = _model(state)
-    return jax.tree.map(lambda x: section.memory * x, model).replace(reach=model.reach)
+    left = lambda number: jnp.maximum(section.memory, _KEPT / jnp.maximum(number, _KEPT))  # noqa: E731
+    of_commands, of_pursuits = left(model.led.sum(axis=-1) + model.lost), left(model.visits)
+    return model.replace(
+        led=model.led * of_commands[..., None],
+        lost=model.lost * of_commands,
+        rewards=model.rewards * of_pursuits,
+        visits=model.visits * of_pursuits,
+    )
 
 
 def follow(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from star.abstraction.regions import Change
 from star.agent.decisions import Decision, Finished, Roadmap
@@ -49,6 +49,13 @@ def plan(
 def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, periods: int) -> CommanderState:
     """Greedy episodes follow the same values."""
     return state
+
+
+def staying(
+    section: CommanderConfig, state: CommanderState, region: Int[Array, "B"], goal_region: Int[Array, "B"]
+) -> Float[Array, "B R"]:
+    """Nothing is known of where commands lead: half of them stay."""
+    return jnp.full((len(region), len(state.chosen)), 0.5)
 
 
 def follow(section: CommanderConfig, state: CommanderState, change: Change, earlier: None, finished: Finished) -> None:

@@ -37,6 +37,12 @@ class CommanderConfig(Section):
     retry: float = Field(
         0.9, ge=0, le=1, description="greedy episodes: what a command is worth where it was given before and led back"
     )
+    trust: float = Field(
+        0.99,
+        ge=0,
+        le=1,
+        description="greedy episodes: chance that a command works which has led nowhere yet; 1: no doubts",
+    )
     hold: Literal[False, True, "region"] = Field(
         True,
         description="command the goal wherever it counts as reached (true), or instead all over its region (region)",
@@ -55,7 +61,9 @@ class CommanderConfig(Section):
     )
     sweeps: Repeats = Field(10, description="sweeps of value iteration of learner model after every k env steps")
     prior: float = Field(5.0, gt=0, description="decisions that weigh as much as the belief in what was not tried")
-    memory: float = Field(0.5, ge=0, le=1, description="share of a decision's weight in the model left an epoch later")
+    memory: float = Field(
+        0.5, ge=0, le=1, description="share of old decisions left in the model an epoch later; 20 of each command stay"
+    )
     goal_margin: float = Field(
         1.0,
         gt=0,

@@ -291,12 +291,22 @@ def test_a_command_that_ends_the_episode_is_worth_less_than_one_that_fails():
     assert dies[1, 3, 2] < stays[1, 3, 2]
 
 
-def test_a_decision_fades_by_the_memory_each_epoch():
+def test_decisions_fade_by_the_memory_each_epoch_but_for_the_last_twenty_of_a_command():
     chosen = settings(learner="model", memory=0.25)
     state = counted(chosen, commander.init(chosen, regions=R), random_batch(0))
-    faded = commander.fade(chosen, state)
-    for name in ("led", "rewards", "visits", "lost"):
-        np.testing.assert_allclose(getattr(faded.model, name), 0.25 * getattr(state.model, name))
+    number = np.asarray(state.model.led.sum(axis=-1) + state.model.lost)
+    scale = 30 / number.max()  # some commands many times, others seldom
+    state = state.replace(model=jax.tree.map(lambda x: scale * x, state.model))
+    faded = commander.fade(chosen, state).model
+    for n, names in ((scale * number, ("led", "lost")), (np.asarray(state.model.visits), ("rewards", "visits"))):
+        for name in names:
+            before, after = (np.asarray(getattr(model, name)) for model in (state.model, faded))
+            for cell in np.ndindex(n.shape):
+                left = 0.25 if n[cell] > 80 else min(1.0, 20 / max(n[cell], 1e-9))
+                np.testing.assert_allclose(after[cell], left * before[cell], rtol=1e-6)
+    assert (scale * number > 20).any() and ((scale * number < 20) & (number > 0)).any()
+    gone = commander.fade(chosen, state.replace(model=jax.tree.map(lambda x: 1000 * x, state.model))).model
+    np.testing.assert_allclose(gone.led.sum(), 250 * state.model.led.sum(), rtol=1e-5)
 
 
 def test_success_alone_counts_or_distance_alone():

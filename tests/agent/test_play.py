@@ -335,44 +335,62 @@ def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
     np.testing.assert_array_equal(short, one)
 
 
-@pytest.mark.parametrize("retry", [0.9, 0.5, 1.0])
-def test_who_comes_back_to_a_region_makes_less_of_what_it_was_told_there(breaking_env, tiny, retry):
-    agent = loading.parse(tiny, {"commander.retry": retry, "commander.hold": False}).hyper()
+@pytest.mark.parametrize(("retry", "trust"), [(0.9, 0.99), (0.5, 1.0), (1.0, 0.5), (1.0, 1.0)])
+def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(breaking_env, tiny, retry, trust):
+    agent = loading.parse(tiny, {"commander.retry": retry, "commander.trust": trust, "commander.hold": False}).hyper()
     spec = replace(Spec.of(breaking_env.env), episode_length=40 * L)
     state = levels.init(agent, spec, key=jax.random.key(0))
     n, rng = int(state.abstraction.count), np.random.default_rng(0)
-    q = rng.uniform(-1, 1, state.commander.q.shape).astype(np.float32)
-    state = state.replace(commander=state.commander.replace(q=jnp.asarray(q)))
+    q, visits = rng.uniform(0, 1, state.commander.q.shape), rng.uniform(0, 9, state.commander.q.shape)
+    led, rewards = rng.uniform(0, 9, state.commander.model.led.shape), visits * rng.uniform(0, 1, visits.shape)
+    model = state.commander.model.replace(
+        led=jnp.asarray(led, jnp.float32),
+        visits=jnp.asarray(visits, jnp.float32),
+        rewards=jnp.asarray(rewards, jnp.float32),
+    )
+    state = state.replace(commander=state.commander.replace(q=jnp.asarray(q, jnp.float32), model=model))
     middles = (state.abstraction.lower + state.abstraction.upper) / 2
     roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
     allowed = np.asarray(roadmap.allowed.greedy)
     route = rng.integers(0, 3, (25, B))  # regions in which decisions are made
+    succeeds = rng.random((25, B)) < 0.3
     playing = levels.of(agent, spec, greedy=True)
     streams = play.start(playing, breaking_env, decisions=40, key=jax.random.key(2))
     seen, memory = scene_of(spec, streams.env), streams.memory
 
     @jax.jit
-    def told(memory, where):
-        there = seen._replace(position=middles[where])
+    def told(memory, where, success):
+        there = seen._replace(position=middles[where], success=success)
         memory = memory.replace(clock=jnp.zeros(B, jnp.int32))
         key = jax.random.key(1)
         return commander.command(
             agent.commander, playing.task, state.commander, roadmap, memory, there, Marks(), env_steps=None, key=key
         )
 
+    def staying(i, g, j):
+        """How likely the command is not to lead out, or the goal in the region not to be reached."""
+        half = agent.commander.prior / 2
+        if i == g == j:
+            return 1 - (rewards[i, g, j] + half) / (visits[i, g, j] + 2 * half)
+        counts = led[1 if j == g else 0, i, j]
+        return (counts[i] + half) / (counts.sum() + 2 * half)
+
     goal = [slow_locate(state.abstraction, point) for point in np.asarray(seen.goal)]
-    tried, before, changed = np.zeros((B, n, n)), np.asarray(memory.region), 0
-    target = np.zeros(B, int)
-    for now in route:
-        memory = told(memory, now)
+    left, stayed, changed = np.zeros((B, n, n)), np.zeros((B, n, n)), 0
+    before, target = np.asarray(memory.region), np.zeros(B, int)
+    for now, success in zip(route, succeeds, strict=True):
+        memory = told(memory, now, jnp.asarray(success, jnp.float32))
         for b in range(B):
             if now[b] != before[b] >= 0:
-                tried[b, before[b], target[b]] += 1
+                left[b, before[b], target[b]] += 1
+            elif now[b] == before[b] and not success[b]:
+                stayed[b, now[b], target[b]] += 1
             values = q[now[b], goal[b], :n]
-            known = values - (1 - retry ** tried[b, now[b]]) * np.abs(values)
+            luck = np.array([staying(now[b], goal[b], j) for j in range(n)]) ** stayed[b, now[b]]
+            known = values * retry ** left[b, now[b]] * luck / (trust * luck + 1 - trust)
             may = allowed[now[b], :n] | (np.arange(n) == now[b])
             best = int(np.argmax(np.where(may, known, -np.inf)))
             assert memory.target[b] == best
             changed += best != int(np.argmax(np.where(may, values, -np.inf)))
         before, target = now, np.asarray(memory.target)
-    assert (changed > 20) == (retry < 1)
+    assert (changed > 20) == (min(retry, trust) < 1)

@@ -126,7 +126,9 @@ def test_of_a_run_that_goes_on_only_what_is_complete_is_shown(make):
 
 
 def test_what_there_is_to_note_of_a_seed_is_among_the_facts(make):
-    full = [row | {"refinement/table_full": int(row["seed"] == 1 and row["env_steps"] >= 200)} for row in metrics(4, (0, 1))]
+    full = [
+        row | {"refinement/table_full": int(row["seed"] == 1 and row["env_steps"] >= 200)} for row in metrics(4, (0, 1))
+    ]
     found = page.facts(read(make(rows=[row | {"abstraction/regions": 9} for row in full])))["notices"]
     assert len(found) == 1 and found[0].startswith("seed 1: the table of regions is full, 9 since 200 env steps")
     assert page.facts(read(make("other")))["notices"] == []

@@ -30,8 +30,11 @@ CLOSER = KIND._replace(measures=KIND.measures[::-1], in_step=True)
 PARTS = KIND._replace(build=lambda config: Parts(config))
 NOTHING = KIND._replace(measures=())
 OTHER = KIND._replace(Config=Learning)
-LATE = Notices(("bandit/error",), lambda rows: {"late": f"{sorted(rows[-1])} since {len(rows)}"} if len(rows) > 6 else {})
-NOTED = KIND._replace(notices=LATE)
+NOTED = KIND._replace(notices=Notices(("bandit/error",), lambda rows: late(rows) if len(rows) > 6 else {}))
+
+
+def late(rows):
+    return {"late": f"{sorted(rows[-1])} since {len(rows)}"}
 
 
 class Parts(Experiment):

@@ -7,7 +7,13 @@ from star.agent.kind import STAR
 from star.training.figures import draw_measures
 
 ROWS = [
-    {"seed": seed, "env_steps": steps, "eval/success_final": 0.5, "eval/success_any": 1.0, "eval/time_at_goal": 90.0 + 20 * seed}
+    {
+        "seed": seed,
+        "env_steps": steps,
+        "eval/success_final": 0.5,
+        "eval/success_any": 1.0,
+        "eval/time_at_goal": 90.0 + 20 * seed,
+    }
     for steps in (100, 200)
     for seed in (0, 1)
 ]
