@@ -246,11 +246,12 @@ class _Worker:
     def _record(self, one: _Run, rows: Sequence[Mapping[str, Any]]) -> bool:
         """Take in an epoch of a trial and report an evaluation to Optuna; whether there was one."""
         one.epochs += 1
+        if mean(rows, self.found.measure.key) is None:
+            return False
         for name, values in one.evaluations.items():
             value = mean(rows, f"eval/{name}")
-            if value is None:
-                return False
-            values.append(value)
+            if value is not None:
+                values.append(value)
         self.ledger.report(one.trial, self._value(one), len(one.evaluations[self.found.measure.name]))
         return True
 
