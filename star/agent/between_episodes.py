@@ -53,8 +53,8 @@ def learn(
     metrics = {
         f"commander/{k}": x for k, x in commander.measure(section, state.commander, roadmap, finished[0]).items()
     }
-    periods = num_envs * (spec.episode_length // section.period)
     metrics["commander/ground"] = _ground(spec, finished.outcome)
+    periods = num_envs * (spec.episode_length // section.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
     goals = Goals.of(outcome, decision.at_goal, cube=spec.cube)
     state, more = _learn_where_commands_lead(config, state, decision, outcome, key=train_key)

@@ -10,7 +10,8 @@
 A share of the environments practises: they pursue random regions instead of the goal. What is hard to reach, and so
 unattractive to all others, is tried there.
 
-Greedy episodes explore nothing, remember where commands led back to, and decide again as soon as a target is reached.
+Greedy episodes explore nothing, remember which commands led back or nowhere, and decide again as soon as a target is
+reached.
 
 Source: STAR (ICLR 2024), section 4.1.
 """
@@ -182,12 +183,9 @@ def _worth_by_now(
     it does after n times, over h, is s^n / (h s^n + 1 - h) (Bayes).
     """
     again = past[..., 0] == region[:, None]
-
-    def number(which: Bool[Array, "B N"]) -> Float[Array, "B R"]:
-        count = lambda target, weight: jnp.zeros(state.chosen.shape).at[target].add(weight)  # noqa: E731
-        return jax.vmap(count)(past[..., 1], which.astype(jnp.float32))
-
-    left, stayed = number(again & (past[..., 2] == 1)), number(again & (past[..., 2] == 0))
+    commanded = jax.nn.one_hot(past[..., 1], len(state.chosen)) * again[..., None]
+    led_out = past[..., 2:] == 1
+    left, stayed = (commanded * led_out).sum(axis=1), (commanded * ~led_out).sum(axis=1)
     luck = jnp.maximum(_rule(section).staying(section, state, region, goal_region) ** stayed, 1e-30)
     return section.retry**left * luck / (section.trust * luck + 1 - section.trust)
 

@@ -27,7 +27,8 @@ def notices(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     success = [row["eval/success_final"] for row in rows if row.get("eval/success_final") is not None]
     ground = [row["commander/ground"] for row in rows if row.get("commander/ground") is not None]
     if len(success) >= _EVALUATIONS and max(success[-_EVALUATIONS:]) < ENOUGH and len(ground) == len(rows):
-        since = next(i for i, share in enumerate(ground) if share >= _SHARE * max(ground))
+        enough = _SHARE * max(ground)
+        since = next(i for i, share in enumerate(ground) if share >= enough)
         if len(rows) - 1 - since >= PATIENCE:
             found["frontier"] = (
                 f"no new ground since {rows[since]['env_steps']:,} env steps, and success_final is below {ENOUGH:g}"
