@@ -17,6 +17,13 @@ from star.config import loading
 
 R, N = 5, 40
 
+# Compiled once, not each time that a test calls them.
+counts = jax.jit(planning.observe)
+recounted = jax.jit(planning.recounted)
+plan, settle = jax.jit(commander.plan), jax.jit(planning.settle, static_argnames="periods")
+fade = jax.jit(commander.fade)
+choose = jax.jit(values.choose)
+
 
 def known(allowed, believed=None):
     """A roadmap that says so; where the regions lie is of no account."""
@@ -27,7 +34,7 @@ def known(allowed, believed=None):
 
 def counted(chosen, state, batch):
     """`state` with the decisions of `batch` in its model."""
-    return planning.observe(chosen, state, None, batch)
+    return counts(chosen, state, None, batch)
 
 
 def settings(**values):
@@ -112,7 +119,7 @@ def test_who_loses_the_task_at_a_distance_does_no_better_than_who_waits_there(ob
         state = empty
         for _ in range(200):
             state = observe(chosen, state, allowed, batch)
-        return float(commander.plan(chosen, state, known(allowed)).q[1, 4, 2])
+        return float(plan(chosen, state, known(allowed)).q[1, 4, 2])
 
     distance = jnp.full(1, 7.0)
     end = commander.lost_reward(chosen, jnp.zeros(1), commander.worth(chosen, distance, jnp.zeros(1)))
@@ -189,15 +196,14 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     believed = rng.random((R, R)) < 0.4
     state = observe(chosen, commander.init(chosen, regions=R), allowed, batch)
     roadmap = known(allowed, jnp.array(believed))
-    planned = jax.jit(planning.plan)(chosen, state, roadmap)
+    planned = plan(chosen, state, roadmap)
     q, reach, visits = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
     np.testing.assert_allclose(planned.q, q, rtol=1e-5)
     np.testing.assert_allclose(planned.model.reach, reach, rtol=1e-5)
-    settle = partial(jax.jit(planning.settle, static_argnames="periods"), chosen)
     q, *_ = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=4, belief=0.1)
     q *= 0.9 + 0.1 * visits / np.maximum(visits.max(axis=-1, keepdims=True), 1.0)
     for before in (state, planned):  # whatever was planned before
-        settled = settle(before, roadmap, periods=4)
+        settled = settle(chosen, before, roadmap, periods=4)
         np.testing.assert_allclose(settled.q, q, rtol=1e-5, atol=1e-12)
         np.testing.assert_array_equal(settled.model.reach, before.model.reach)
 
@@ -213,8 +219,8 @@ def corridor(batch_of, *, shortcut=False, greedy=False):
         state = counted(chosen, state, batch)
     roadmap = known(everything, jnp.array(neighbours))
     if greedy:
-        return planning.settle(chosen, state, roadmap, periods=10).q
-    return planning.plan(chosen, state, roadmap).q
+        return settle(chosen, state, roadmap, periods=10).q
+    return plan(chosen, state, roadmap).q
 
 
 def many(region, target, next_region, *, goal=4, count=100, lost=0.0, reward=0.0):
@@ -280,8 +286,8 @@ def test_where_the_goals_region_is_cut_nobody_aims_beside_the_goal():
     for batch in (many(0, 2, 2, goal=2, reward=0.5), many(2, 2, 2, goal=2, reward=1.0)):
         state = counted(chosen, state, batch)
     origin, nothing = jnp.array([0, 1, 2, 2, 4]), many(0, 0, 0, count=0)
-    state = state.replace(model=planning.recounted(chosen, state.model, nothing, nothing, origin))
-    settled = planning.settle(chosen, state, known(everything, jnp.ones((R, R), bool)), periods=20)
+    state = state.replace(model=recounted(chosen, state.model, nothing, nothing, origin))
+    settled = settle(chosen, state, known(everything, jnp.ones((R, R), bool)), periods=20)
     for region, goal, wrong in ((0, 3, 2), (2, 3, 2), (0, 2, 3), (3, 2, 3)):
         assert settled.q[region, goal, goal] > settled.q[region, goal, wrong] + 0.6
 
@@ -297,7 +303,7 @@ def test_decisions_fade_by_the_memory_each_epoch_but_for_the_last_twenty_of_a_co
     number = np.asarray(state.model.led.sum(axis=-1) + state.model.lost)
     scale = 30 / number.max()  # some commands many times, others seldom
     state = state.replace(model=jax.tree.map(lambda x: scale * x, state.model))
-    faded = commander.fade(chosen, state).model
+    faded = fade(chosen, state).model
     for n, names in ((scale * number, ("led", "lost")), (np.asarray(state.model.visits), ("rewards", "visits"))):
         for name in names:
             before, after = (np.asarray(getattr(model, name)) for model in (state.model, faded))
@@ -305,7 +311,7 @@ def test_decisions_fade_by_the_memory_each_epoch_but_for_the_last_twenty_of_a_co
                 left = 0.25 if n[cell] > 80 else min(1.0, 20 / max(n[cell], 1e-9))
                 np.testing.assert_allclose(after[cell], left * before[cell], rtol=1e-6)
     assert (scale * number > 20).any() and ((scale * number < 20) & (number > 0)).any()
-    gone = commander.fade(chosen, state.replace(model=jax.tree.map(lambda x: 1000 * x, state.model))).model
+    gone = fade(chosen, state.replace(model=jax.tree.map(lambda x: 1000 * x, state.model))).model
     np.testing.assert_allclose(gone.led.sum(), 250 * state.model.led.sum(), rtol=1e-5)
 
 
@@ -376,10 +382,10 @@ def test_a_goals_region_may_always_follow_itself():
     state = CommanderState(q=jnp.zeros((R, R, R)).at[..., 0].set(1.0), chosen=jnp.zeros(R))
     many, key = jnp.zeros(300, jnp.int32), jax.random.key(0)
     for there, greedy, random in ((many, {0}, {0, 1}), (many + 2, {1}, {1})):
-        assert set(values.choose(state, allowed, many, there, epsilon=0.0, key=key).tolist()) == greedy
-        assert set(values.choose(state, allowed, many, there, epsilon=1.0, key=key).tolist()) == random
+        assert set(choose(state, allowed, many, there, epsilon=0.0, key=key).tolist()) == greedy
+        assert set(choose(state, allowed, many, there, epsilon=1.0, key=key).tolist()) == random
     for there, practised, greedy in ((many, many + 3, {1}), (many + 3, many, {0})):  # what is practised is the goal
-        chosen = values.choose(state, allowed, many, there, practised=practised, epsilon=0.0, key=key)
+        chosen = choose(state, allowed, many, there, practised=practised, epsilon=0.0, key=key)
         assert set(chosen.tolist()) == greedy
     worth, targets = values.towards(state, allowed, jnp.int32(0))
     assert worth.tolist() == [1.0, *[0.0] * (R - 1)] and targets.tolist() == [0, *[1] * (R - 1)]
@@ -389,7 +395,7 @@ def test_the_greedy_choice_is_the_best_allowed_target_and_ties_break_at_random()
     q = jnp.zeros((R, R, R)).at[0, 1].set(jnp.array([0.0, 3.0, 9.0, 3.0, 1.0]))
     allowed = jnp.ones((R, R), bool).at[:, 2].set(False)
     many = jnp.zeros(500, jnp.int32)
-    targets = values.choose(
+    targets = choose(
         CommanderState(q=q, chosen=jnp.zeros(R)),
         Successors(greedy=allowed, explore=allowed),
         many,
@@ -406,7 +412,7 @@ def test_epsilon_is_the_share_of_random_choices():
     q = jnp.zeros((R, R, R)).at[..., 0].set(1.0)
     allowed = jnp.ones((R, R), bool)
     many = jnp.zeros(4000, jnp.int32)
-    targets = values.choose(
+    targets = choose(
         CommanderState(q=q, chosen=jnp.zeros(R)),
         Successors(greedy=allowed, explore=allowed),
         many,
@@ -427,9 +433,7 @@ def test_who_practises_pursues_its_region_by_the_chances_to_reach_it():
     )
     zeros = jnp.zeros(2, jnp.int32)
     practised = jnp.array([-1, 3])
-    targets = values.choose(
-        state, everything, zeros, zeros + 1, practised=practised, epsilon=0.0, key=jax.random.key(0)
-    )
+    targets = choose(state, everything, zeros, zeros + 1, practised=practised, epsilon=0.0, key=jax.random.key(0))
     assert targets.tolist() == [2, 4]
 
 
@@ -510,7 +514,7 @@ def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
     led, lost = np.stack(led), np.stack([visits[0], rewards[0]])
     led[:, :, :, 3:] = led[:, 3:] = led[:, :, 3:] = 0  # nothing there
     earlier = Model(led=led, rewards=rewards, visits=visits, lost=lost, reach=reach)
-    model = jax.jit(planning.recounted)(chosen, earlier, batch, cells, jnp.array(ORIGIN))
+    model = recounted(chosen, earlier, batch, cells, jnp.array(ORIGIN))
     for name, table in slow_recount(batch, cells, earlier, prior=2.0).items():
         np.testing.assert_allclose(getattr(model, name), table, rtol=1e-5, atol=1e-6)
 
@@ -534,7 +538,7 @@ def test_without_cuts_counting_anew_changes_nothing():
     chosen, batch = settings(learner="model"), random_batch(0)
     before = commander.init(chosen, regions=R)
     model = counted(chosen, before, batch).model
-    again = planning.recounted(chosen, before.model, batch, batch, jnp.arange(R))
+    again = recounted(chosen, before.model, batch, batch, jnp.arange(R))
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), again, model)
 
 
@@ -545,7 +549,7 @@ def test_who_began_beyond_the_cut_tells_nothing_of_this_side():
     join = partial(jax.tree.map, lambda *parts: np.concatenate(parts))
     batch = join(many(1, 2, 1), many(1, 2, 2))
     cells = join(many(1, 2, 1), many(3, 2, 2))
-    after = planning.recounted(chosen, began.model, batch, cells, jnp.array(ORIGIN))
+    after = recounted(chosen, began.model, batch, cells, jnp.array(ORIGIN))
     led = np.asarray(after.led)[0, :, 2]
     assert led[1, 2] / led[1].sum() < 0.02 and led[3, 2] / led[3].sum() > 0.98
 

@@ -1,5 +1,7 @@
 """What SGIM makes of an epoch: its lessons against loops, its teachers' budgets, and the trainer that follows them."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +33,7 @@ assign = jax.jit(strategies.assign)
 learn = jax.jit(lessons.learn)
 
 
+@cache
 def four_regions():
     return regions.create(((0.0, 0.0), (4.0, 4.0)), ((2.0,), (2.0,)), max_regions=6)
 
@@ -70,7 +73,7 @@ def lesson_of(config, state=None, *, taught=None, seed=0, teachers=None):
 
 
 def located(point):
-    table = four_regions()
+    table = jax.device_get(four_regions())
     return next(
         j for j in range(4) if (table.lower[j] <= point).all() and ((point < table.upper[j]) | (point >= 4)).all()
     )
