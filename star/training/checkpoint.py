@@ -155,12 +155,12 @@ class Checkpoints:
         `example` (arrays or their shapes) gives the structure it must have, and the devices: else the first one here.
         """
         here = devices.everywhere(None)
-        shapes = jax.eval_shape(plain, example)
-        template = jax.tree.map(
-            lambda x, like: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=getattr(like, "sharding", None) or here),
-            shapes,
-            example,
-        )
+
+        def written(like: Any) -> jax.ShapeDtypeStruct:
+            leaf = jax.eval_shape(plain, like)
+            return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=getattr(like, "sharding", None) or here)
+
+        template = jax.tree.map(written, example)
         path, number = self._path / str(step), self._about(step)["format"]
         hook, sys.unraisablehook = sys.unraisablehook, partial(_report, sys.unraisablehook)
         try:
