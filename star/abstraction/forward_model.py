@@ -20,7 +20,9 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float
 
+from star.abstraction import regions
 from star.abstraction.reachability import ROUNDING, Network
+from star.abstraction.regions import Abstraction
 from star.abstraction.sections import ForwardModelConfig
 from star.learners import replay
 from star.learners.networks import MLP, apply, descend
@@ -130,6 +132,14 @@ def visited(state: ForwardModelState) -> tuple[Float[Array, "N d"], Float[Array,
     """Start states in the buffer and a mask of those that are real."""
     items, written = replay.contents(state.ring)
     return items.start, items.weight * written
+
+
+def traffic(state: ForwardModelState, abstraction: Abstraction) -> Float[Array, "R R"]:
+    """How many of the periods in the buffer began in each region (row) and ended in each (column)."""
+    items, written = replay.contents(state.ring)
+    began, ended = (regions.locate(abstraction, point) for point in (items.start, items.end))
+    none = jnp.zeros((abstraction.capacity, abstraction.capacity))
+    return none.at[began, ended].add(items.weight * written)
 
 
 def _scaling(space: Float[Array, "2 d"]) -> tuple[Array, Array]:

@@ -98,10 +98,11 @@ def refine(
         weight=guide.urgency(config.sgim, state.sgim),
         key=key,
     )
+    traffic = forward_model.traffic(state.forward_model, change.after)
     state = state.replace(
         abstraction=change.after,
         graph=graph,
-        commander=commander.follow(config.commander, state.commander, change, known, finished),
+        commander=commander.follow(config.commander, state.commander, change, known, finished, traffic),
         sgim=guide.follow(state.sgim, change),
     )
     return state, {f"refinement/{name}": value for name, value in metrics.items()}

@@ -263,16 +263,21 @@ def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *,
 
 
 def follow(
-    section: CommanderConfig, state: CommanderState, change: Change, known: CommanderState, finished: Finished
+    section: CommanderConfig,
+    state: CommanderState,
+    change: Change,
+    known: CommanderState,
+    finished: Finished,
+    traffic: Float[Array, "R R"],
 ) -> CommanderState:
     """The tables in today's regions, after an epoch that began with what was `known` and whose periods are `finished`.
 
-    Parts inherit the values of the whole.
+    Parts inherit the values of the whole. `traffic` says how many remembered periods led from each region into each.
     """
     origin = change.origin
     parts = jnp.zeros(len(origin)).at[origin].add(1.0)[origin]
     cube = (origin[:, None, None], origin[:, None], origin)
-    model = _rule(section).follow(section, state, change, known.model, finished)
+    model = _rule(section).follow(section, state, change, known.model, finished, traffic)
     return state.replace(q=state.q[cube], chosen=state.chosen[origin] / parts, model=model)
 
 

@@ -10,8 +10,8 @@ and believed to be as where the goal is elsewhere.
 The probabilities of i' sum to less than 1 where episodes were lost (terminated). What was not tried is believed to
 succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
 region gets there. `prior` decisions weigh as much as this belief. Where regions were cut, the epoch's decisions are
-counted anew by today's regions (`follow`). Greedy episodes, in which nothing is learnt, follow a plan with hardly any
-of it (`settle`).
+counted anew by today's regions, and older ones are shared out by where periods began and ended (`follow`). Greedy
+episodes, in which nothing is learnt, follow a plan with hardly any belief (`settle`).
 
 Those who practise pursue a region by the same plan with another reward, 1 in the region pursued.
 
@@ -128,12 +128,17 @@ def fade(section: CommanderConfig, state: CommanderState) -> Model:
 
 
 def follow(
-    section: CommanderConfig, state: CommanderState, change: Change, earlier: Model, finished: Finished
+    section: CommanderConfig,
+    state: CommanderState,
+    change: Change,
+    earlier: Model,
+    finished: Finished,
+    traffic: Float[Array, "R R"],
 ) -> Model:
     """The model after an epoch whose regions were cut, so that region j of today is (a part of) `origin` [j] of then.
 
     It becomes the `earlier` one, with which the epoch began, and all decisions of the epoch, `finished`, counted anew
-    by today's regions.
+    by today's regions. `traffic` says how many periods, of all that are remembered, led from each of them into each.
     """
     find = partial(regions.locate, change.after)
     decision, outcome = finished
@@ -144,14 +149,19 @@ def follow(
         goal_region=goal_region,
         target=jnp.where(decision.at_goal, goal_region, decision.target),
     )
-    model = recounted(section, earlier, decision, cells, change.origin)
+    model = recounted(section, earlier, decision, cells, change.origin, traffic)
     origin = change.origin
     cube = (origin[:, None, None], origin[:, None], origin)
     return model.replace(reach=_model(state).reach[cube])
 
 
 def recounted(
-    section: CommanderConfig, earlier: Model, batch: Decision, cells: Decision, origin: Int[Array, "R"]
+    section: CommanderConfig,
+    earlier: Model,
+    batch: Decision,
+    cells: Decision,
+    origin: Int[Array, "R"],
+    traffic: Float[Array, "R R"],
 ) -> Model:
     """The `earlier` model and the decisions of `batch`, but for `reach`.
 
@@ -168,7 +178,7 @@ def recounted(
         rewards=in_pursuit(counted.rewards),
         visits=in_pursuit(counted.visits),
     )
-    old = _inherited(section, earlier, new, origin, parts)
+    old = _inherited(section, earlier, traffic, origin, parts)
     return jax.tree.map(jnp.add, old, new)
 
 
@@ -228,26 +238,33 @@ def _iterated(
 
 
 def _inherited(
-    section: CommanderConfig, earlier: Model, new: Model, origin: Int[Array, "R"], parts: Float[Array, "R"]
+    section: CommanderConfig,
+    earlier: Model,
+    traffic: Float[Array, "R R"],
+    origin: Int[Array, "R"],
+    parts: Float[Array, "R"],
 ) -> Model:
-    """Counts of before the epoch that cut each `origin` into so many `parts`, beside its own counts `new`.
+    """Counts of before the epoch that cut each `origin` into so many `parts`.
 
-    Nobody knows any more where in a region these decisions began and ended. So those that may have begun in a part are
-    but a belief in what happens there, of `section.prior` decisions at most, as are rewards where the goal may have
-    been in a part, and all arrived in the parts as those of the epoch did. What aiming at the goal paid tells nothing
-    of aiming at a part in which the goal is not.
+    Nobody knows any more which command led from where to where within the regions of then. But how many periods led
+    from each part into each is known by `traffic`, and by that the counts are shared out: nothing leads through a wall
+    where nothing ever did. What began in a part is but a belief in what happens there, of `section.prior` decisions at
+    most, as are rewards where the goal may have been in a part. What aiming at the goal paid tells nothing of aiming
+    at a part in which the goal is not.
     """
-    cube = (origin[:, None, None], origin[:, None], origin)
-    arrived = jnp.zeros_like(new.led).at[..., origin].add(new.led)[..., origin]
-    share = jnp.where(arrived > 0, new.led / jnp.where(arrived > 0, arrived, 1.0), 1 / parts)
-    led, lost = earlier.led[:, *cube] * share, earlier.lost[:, *cube[1:]]
-    beside = _beside(origin)
-    rewards, visits = (jnp.where(beside, 0.0, table[cube]) for table in (earlier.rewards, earlier.visits))
+    cut = parts > 1
+    pair, cube = (origin[:, None], origin), (origin[:, None, None], origin[:, None], origin)
+    together = jnp.zeros_like(traffic).at[pair].add(traffic)[pair]
+    share = jnp.where(cut[:, None] | cut, traffic / jnp.maximum(together, 1.0), 1.0)
+    began = traffic.sum(axis=1)
+    of_part = jnp.where(cut, began / jnp.maximum(jnp.zeros_like(began).at[origin].add(began)[origin], 1.0), 1.0)
+    led, lost = earlier.led[:, *cube] * share[:, None], earlier.lost[:, *pair] * of_part[:, None]
+    kept = jnp.where(_beside(origin), 0.0, of_part[:, None, None])
+    rewards, visits = earlier.rewards[cube] * kept, earlier.visits[cube] * kept
 
-    cut = parts[:, None] > 1
     doubt = lambda number: section.prior / jnp.maximum(number, section.prior)  # noqa: E731
-    of_commands = jnp.where(cut, doubt(led.sum(axis=-1) + lost), 1.0)
-    of_pursuits = jnp.where(cut[:, None] | cut, doubt(visits), 1.0)
+    of_commands = jnp.where(cut[:, None], doubt(led.sum(axis=-1) + lost), 1.0)
+    of_pursuits = jnp.where((cut[:, None] | cut)[..., None], doubt(visits), 1.0)
     return earlier.replace(
         led=led * of_commands[..., None],
         lost=lost * of_commands,

@@ -11,12 +11,14 @@ Source: STAR (ICLR 2024), section 4.1; what teachers choose: DQfD (Hester et al.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from star.abstraction.regions import Change
-from star.agent.decisions import Decision, Finished, Roadmap
+from star.agent.decisions import Decision, Roadmap
 from star.agent.sections import CommanderConfig
 from star.agent.values import CommanderState, td_error, towards_goals
 
@@ -58,7 +60,7 @@ def staying(
     return jnp.full((len(region), len(state.chosen)), 0.5)
 
 
-def follow(section: CommanderConfig, state: CommanderState, change: Change, earlier: None, finished: Finished) -> None:
+def follow(section: CommanderConfig, state: CommanderState, change: Change, *_: Any) -> None:
     """There is no model that could follow."""
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star.abstraction import forward_model, reachability
+from star.abstraction import forward_model, reachability, regions
 from star.abstraction.forward_model import Outcome
 from star.config import loading
 
@@ -104,3 +104,24 @@ def test_outcomes_of_weight_0_teach_nothing_and_were_not_visited(train):
 def test_nothing_was_visited_before_the_first_outcome():
     state = forward_model.init(jax.random.key(0), settings(), space=SPACE)
     assert float(forward_model.visited(state)[1].sum()) == 0
+
+
+def test_traffic_counts_the_remembered_periods_between_regions(train):
+    chosen = settings()
+    table = regions.create(tuple(np.asarray(SPACE)), ((0.0, 8.0), (5.0,)), max_regions=8)
+    state = forward_model.init(jax.random.key(0), chosen, space=SPACE)
+    assert not np.asarray(forward_model.traffic(state, table)).any()
+    batch = random_outcome(20).replace(weight=np.float32(np.arange(20) % 3 > 0))
+    batch = batch.replace(end=batch.start[::-1] + 0.5)
+    state, _ = train(chosen, state, batch, jax.random.key(1))
+    expected = np.zeros((8, 8))
+    boxes = list(zip(np.asarray(table.lower)[:6], np.asarray(table.upper)[:6], strict=True))
+
+    def inside(point):
+        point = np.clip(point, SPACE[0], np.asarray(SPACE[1]) - 1e-3)
+        return next(r for r, (lower, upper) in enumerate(boxes) if (lower <= point).all() and (point < upper).all())
+
+    for start, end, weight in zip(batch.start, batch.end, batch.weight, strict=True):
+        expected[inside(start), inside(end)] += weight
+    np.testing.assert_array_equal(forward_model.traffic(state, table), expected)
+    assert expected.sum() == 13 and (expected > 0).sum() > 5

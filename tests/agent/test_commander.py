@@ -286,7 +286,7 @@ def test_where_the_goals_region_is_cut_nobody_aims_beside_the_goal():
     for batch in (many(0, 2, 2, goal=2, reward=0.5), many(2, 2, 2, goal=2, reward=1.0)):
         state = counted(chosen, state, batch)
     origin, nothing = jnp.array([0, 1, 2, 2, 4]), many(0, 0, 0, count=0)
-    state = state.replace(model=recounted(chosen, state.model, nothing, nothing, origin))
+    state = state.replace(model=recounted(chosen, state.model, nothing, nothing, origin, jnp.ones((R, R))))
     settled = settle(chosen, state, known(everything, jnp.ones((R, R), bool)), periods=20)
     for region, goal, wrong in ((0, 3, 2), (2, 3, 2), (0, 2, 3), (3, 2, 3)):
         assert settled.q[region, goal, goal] > settled.q[region, goal, wrong] + 0.6
@@ -456,7 +456,7 @@ def test_the_reward_of_a_period_is_the_max_or_mean_over_all_its_steps(reward):
 ORIGIN = [0, 1, 2, 1, 4]
 
 
-def slow_recount(batch, cells, earlier, *, prior):
+def slow_recount(batch, cells, earlier, traffic, *, prior):
     """The model after an epoch whose decisions are `batch`, in today's regions `cells`, in loops over cells."""
     every = range(R)
     parts = [ORIGIN.count(o) for o in ORIGIN]
@@ -474,26 +474,29 @@ def slow_recount(batch, cells, earlier, *, prior):
                 new["visits"][i, g, j] += told
                 new["rewards"][i, g, j] += told * batch.reward[d]
     model = {name: table.copy() for name, table in new.items()}
+    of_whole = lambda i: [m for m in every if ORIGIN[m] == ORIGIN[i]]  # noqa: E731
     for i in every:
+        began = sum(traffic[k].sum() for k in of_whole(i))
+        part = 1.0 if parts[i] == 1 else traffic[i].sum() / began if began else 0.0
         for j in every:
             for aim in (0, 1):
                 whence = earlier.led[aim, ORIGIN[i], ORIGIN[j]]
                 old = np.zeros(R)
                 for n in every:
-                    siblings = [m for m in every if ORIGIN[m] == ORIGIN[n]]
-                    arrived = sum(new["led"][aim, i, j, m] for m in siblings)
-                    old[n] = whence[ORIGIN[n]] * (new["led"][aim, i, j, n] / arrived if arrived else 1 / parts[n])
-                lost = earlier.lost[aim, ORIGIN[i], ORIGIN[j]]
+                    between = sum(traffic[k, m] for k in of_whole(i) for m in of_whole(n))
+                    share = traffic[i, n] / between if between else 0.0
+                    old[n] = whence[ORIGIN[n]] * (share if parts[i] > 1 or parts[n] > 1 else 1.0)
+                lost = part * earlier.lost[aim, ORIGIN[i], ORIGIN[j]]
                 number = old.sum() + lost
-                kept = min(1.0, prior / number) if parts[i] > 1 else 1.0
+                kept = min(1.0, prior / max(number, 1e-9)) if parts[i] > 1 else 1.0
                 model["led"][aim, i, j] += kept * old
                 model["lost"][aim, i, j] += kept * lost
             for g in every:
                 if ORIGIN[g] != ORIGIN[j] or g == j:
-                    number = earlier.visits[ORIGIN[i], ORIGIN[g], ORIGIN[j]]
-                    kept = min(1.0, prior / number) if max(parts[i], parts[g]) > 1 else 1.0
+                    number = part * earlier.visits[ORIGIN[i], ORIGIN[g], ORIGIN[j]]
+                    kept = min(1.0, prior / max(number, 1e-9)) if max(parts[i], parts[g]) > 1 else 1.0
                     model["visits"][i, g, j] += kept * number
-                    model["rewards"][i, g, j] += kept * earlier.rewards[ORIGIN[i], ORIGIN[g], ORIGIN[j]]
+                    model["rewards"][i, g, j] += kept * part * earlier.rewards[ORIGIN[i], ORIGIN[g], ORIGIN[j]]
     return model
 
 
@@ -514,8 +517,9 @@ def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
     led, lost = np.stack(led), np.stack([visits[0], rewards[0]])
     led[:, :, :, 3:] = led[:, 3:] = led[:, :, 3:] = 0  # nothing there
     earlier = Model(led=led, rewards=rewards, visits=visits, lost=lost, reach=reach)
-    model = recounted(chosen, earlier, batch, cells, jnp.array(ORIGIN))
-    for name, table in slow_recount(batch, cells, earlier, prior=2.0).items():
+    traffic = np.random.default_rng(seed).integers(0, 3, (R, R)).astype(np.float32)
+    model = recounted(chosen, earlier, batch, cells, jnp.array(ORIGIN), traffic)
+    for name, table in slow_recount(batch, cells, earlier, traffic, prior=2.0).items():
         np.testing.assert_allclose(getattr(model, name), table, rtol=1e-5, atol=1e-6)
 
     boxes = regions.create(((0.0, 0.0), (5.0, 1.0)), ((1.0, 2.0, 3.0, 4.0), ()), max_regions=R)
@@ -526,7 +530,7 @@ def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
     state = CommanderState(q=jnp.array(q), chosen=jnp.arange(1.0, R + 1), model=earlier.replace(reach=reach + 1))
     change = Change(before=boxes, after=boxes, splits=None, origin=jnp.array(ORIGIN))
     began = state.replace(model=earlier)
-    after = jax.jit(commander.follow)(chosen, state, change, began, finished)
+    after = jax.jit(commander.follow)(chosen, state, change, began, finished, traffic)
     jax.tree.map(np.testing.assert_array_equal, after.model.replace(reach=0), model.replace(reach=0))
     cube = np.ix_(ORIGIN, ORIGIN, ORIGIN)
     np.testing.assert_array_equal(after.q, q[cube])
@@ -538,7 +542,7 @@ def test_without_cuts_counting_anew_changes_nothing():
     chosen, batch = settings(learner="model"), random_batch(0)
     before = commander.init(chosen, regions=R)
     model = counted(chosen, before, batch).model
-    again = recounted(chosen, before.model, batch, batch, jnp.arange(R))
+    again = recounted(chosen, before.model, batch, batch, jnp.arange(R), jnp.zeros((R, R)))
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), again, model)
 
 
@@ -549,7 +553,8 @@ def test_who_began_beyond_the_cut_tells_nothing_of_this_side():
     join = partial(jax.tree.map, lambda *parts: np.concatenate(parts))
     batch = join(many(1, 2, 1), many(1, 2, 2))
     cells = join(many(1, 2, 1), many(3, 2, 2))
-    after = recounted(chosen, began.model, batch, cells, jnp.array(ORIGIN))
+    traffic = jnp.zeros((R, R)).at[1, 1].set(700.0).at[3, 2].set(1000.0)
+    after = recounted(chosen, began.model, batch, cells, jnp.array(ORIGIN), traffic)
     led = np.asarray(after.led)[0, :, 2]
     assert led[1, 2] / led[1].sum() < 0.02 and led[3, 2] / led[3].sum() > 0.98
 

@@ -308,7 +308,9 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
     )
     outcome = Outcome(start=start, lower=start, upper=start, end=end, weight=ones)
     known = state.commander
-    learnt = commander.follow(config.commander, known, change, known, Finished(decision, outcome))
+    learnt = commander.follow(
+        config.commander, known, change, known, Finished(decision, outcome), jnp.zeros_like(known.q[0])
+    )
     np.testing.assert_array_equal(learnt.q, expected)
     assert float(learnt.chosen[0]) == float(learnt.chosen[count]) == 0.5
     led = np.argwhere(np.asarray(learnt.model.led))
