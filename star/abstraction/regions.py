@@ -198,6 +198,12 @@ def adjacent(abstraction: Abstraction) -> Bool[Array, "R R"]:
     return faces & abstraction.active[:, None] & abstraction.active[None]
 
 
+def over_parts(table: Float[Array, "*R"], origin: Int[Array, "R"]) -> Float[Array, "*R"]:
+    """Sums of `table` along all its axes, each of regions, over the parts of what a region was cut from (`origin`)."""
+    cell = jnp.ix_(*[origin] * table.ndim)
+    return jnp.zeros_like(table).at[cell].add(table)[cell]
+
+
 def inherit(table: Array, *, parent: Array, child: Array, axes: Sequence[int]) -> Array:
     """Copy what `table` holds for region `parent` to region `child` along each of `axes` in turn."""
     for axis in axes:

@@ -275,8 +275,8 @@ def follow(
     Parts inherit the values of the whole. `traffic` says how many remembered periods led from each region into each.
     """
     origin = change.origin
-    parts = jnp.zeros(len(origin)).at[origin].add(1.0)[origin]
-    cube = (origin[:, None, None], origin[:, None], origin)
+    parts = regions.over_parts(jnp.ones(len(origin)), origin)
+    cube = jnp.ix_(origin, origin, origin)
     model = _rule(section).follow(section, state, change, known.model, finished, traffic)
     return state.replace(q=state.q[cube], chosen=state.chosen[origin] / parts, model=model)
 

@@ -150,9 +150,7 @@ def follow(
         target=jnp.where(decision.at_goal, goal_region, decision.target),
     )
     model = recounted(section, earlier, decision, cells, change.origin, traffic)
-    origin = change.origin
-    cube = (origin[:, None, None], origin[:, None], origin)
-    return model.replace(reach=_model(state).reach[cube])
+    return model.replace(reach=_model(state).reach[jnp.ix_(*[change.origin] * 3)])
 
 
 def recounted(
@@ -167,7 +165,6 @@ def recounted(
 
     `cells` holds them with today's regions, but for the targets, which count as all their parts unless they were goals.
     """
-    parts = jnp.zeros(len(origin)).at[origin].add(1.0)[origin]
     counted = _counted(jax.tree.map(jnp.zeros_like, earlier), batch, cells=cells)
     beside, own = _beside(origin), jnp.eye(len(origin), dtype=bool)
     to_parts = lambda table: table.at[0].set(table[0][:, origin])  # noqa: E731
@@ -178,7 +175,7 @@ def recounted(
         rewards=in_pursuit(counted.rewards),
         visits=in_pursuit(counted.visits),
     )
-    old = _inherited(section, earlier, traffic, origin, parts)
+    old = _inherited(section, earlier, traffic, origin)
     return jax.tree.map(jnp.add, old, new)
 
 
@@ -238,13 +235,9 @@ def _iterated(
 
 
 def _inherited(
-    section: CommanderConfig,
-    earlier: Model,
-    traffic: Float[Array, "R R"],
-    origin: Int[Array, "R"],
-    parts: Float[Array, "R"],
+    section: CommanderConfig, earlier: Model, traffic: Float[Array, "R R"], origin: Int[Array, "R"]
 ) -> Model:
-    """Counts of before the epoch that cut each `origin` into so many `parts`.
+    """Counts of before the epoch in which regions were cut, by those of after it.
 
     Nobody knows any more which command led from where to where within the regions of then. But how many periods led
     from each part into each is known by `traffic`, and by that the counts are shared out: nothing leads through a wall
@@ -252,12 +245,12 @@ def _inherited(
     most, as are rewards where the goal may have been in a part. What aiming at the goal paid tells nothing of aiming
     at a part in which the goal is not.
     """
-    cut = parts > 1
-    pair, cube = (origin[:, None], origin), (origin[:, None, None], origin[:, None], origin)
-    together = jnp.zeros_like(traffic).at[pair].add(traffic)[pair]
-    share = jnp.where(cut[:, None] | cut, traffic / jnp.maximum(together, 1.0), 1.0)
+    pair, cube = jnp.ix_(origin, origin), jnp.ix_(origin, origin, origin)
+    together = partial(regions.over_parts, origin=origin)
+    cut = together(jnp.ones(len(origin))) > 1
+    share = jnp.where(cut[:, None] | cut, traffic / jnp.maximum(together(traffic), 1.0), 1.0)
     began = traffic.sum(axis=1)
-    of_part = jnp.where(cut, began / jnp.maximum(jnp.zeros_like(began).at[origin].add(began)[origin], 1.0), 1.0)
+    of_part = jnp.where(cut, began / jnp.maximum(together(began), 1.0), 1.0)
     led, lost = earlier.led[:, *cube] * share[:, None], earlier.lost[:, *pair] * of_part[:, None]
     kept = jnp.where(_beside(origin), 0.0, of_part[:, None, None])
     rewards, visits = earlier.rewards[cube] * kept, earlier.visits[cube] * kept
