@@ -39,7 +39,9 @@ from tests.small import EPOCH, RUN, unpacked
 
 ROOT = Path(__file__).parents[2]
 TIMES = ("wall_s", "env_steps_per_s")
+# Like the runs of older formats in `tests/data`, whose epoch is then compiled once for all.
 TINY = RUN | {
+    "tutor": RUN["tutor"] | {"straight": False},
     "sgim": {
         "goals": True,
         "strategies": ["autonomous", "babbling"],
@@ -290,7 +292,7 @@ def test_a_run_of_an_older_format_goes_on_from_its_checkpoint(name, tmp_path, ca
     run_dir = unpacked(name, tmp_path)
     before = rows(run_dir)
     with pytest.raises(UserError, match="made with tutor.straight False, not True"):
-        trainer.train(tiny(), run_dir, resume=True, quiet=True)
+        trainer.train(tiny(tutor__straight=True), run_dir, resume=True, quiet=True)
     config = load_run(run_dir, {"trainer.total_env_steps": 4 * EPOCH})
     result = trainer.train(config, run_dir, resume=True, quiet=True)
     assert result.env_steps == 4 * EPOCH and capsys.readouterr().err == ""
