@@ -200,7 +200,7 @@ def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
     script = load("checks/abstraction")
     spec = Spec.of(breaking_env.env)
     agent = loading.parse(tiny, {"abstraction.cuts": [[8.0], [8.0]]}).hyper()
-    state = levels.init(agent, spec, key=jax.random.key(0))
+    state = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
     verdict = state.graph.verdict.at[0, 1].set(REACHES).at[1, 0].set(MISSES)
     state = state.replace(graph=state.graph.replace(verdict=verdict))
     # (region, target, next region): 0 -> 1 is right in 3 of 4 rollouts, 1 -> 0 in 1 of 2, and one does not count.
@@ -254,7 +254,7 @@ def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_
     agent = loading.parse(
         tiny, {"abstraction.cuts": [[8.0], [8.0]], "refinement.parts": 8, "refinement.depth": 3}
     ).hyper()
-    state = levels.init(agent, spec, key=jax.random.key(0))
+    state = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
     layer = state.forward_model.params["params"]["Dense_1"]
     moving = {"kernel": 0.1 * layer["kernel"], "bias": jax.numpy.array([1.0, 0.0])}
     params = {"params": {**state.forward_model.params["params"], "Dense_1": moving}}

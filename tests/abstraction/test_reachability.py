@@ -163,11 +163,11 @@ def test_where_room_is_scarce_the_parts_with_most_visits_are_halved():
     # mixed, and there is room to halve only one of them. Nobody was in what is left of the other.
     move = displaced(*f32(np.full(1, 4.0)))
     corners = f32([0.0], [8.0]), f32([4.25], [11.75])
+    how = {"depth": 2, "parts": 3, "reach_share": 0.999, "miss_share": 0.0, "min_visits": 1}
+    examined = jax.jit(partial(reachability.examine, move, **how))
     for few, many in (([1.0], [6.0]), ([6.0], [1.0])):
         starts, seen = f32(np.array([few] * 5 + [many] * 9), np.ones(14))
-        leaves = reachability.examine(
-            move, *corners, starts, seen, depth=2, parts=3, reach_share=0.999, miss_share=0.0, min_visits=1
-        )
+        leaves = examined(*corners, starts, seen)
         lower, upper, _ = used(leaves)
         halved = 0.0 if many == [1.0] else 4.0
         assert sorted(zip(lower[:, 0], upper[:, 0], strict=True)) == sorted(
@@ -178,10 +178,9 @@ def test_where_room_is_scarce_the_parts_with_most_visits_are_halved():
 def test_early_rounds_of_halving_leave_room_for_later_ones():
     # All of [0, 16] is mixed at every depth; the part visited most is still halved in the last round.
     starts, seen = f32(np.concatenate([np.full((99, 1), 0.1), np.linspace(0.2, 15.8, 64)[:, None]]), np.ones(163))
-    leaves = reachability.examine(
-        displaced(*f32(np.zeros(1))), f32([0.0], [16.0]), f32([-99.0], [99.0]), starts, seen,
-        depth=6, parts=12, reach_share=2.0, miss_share=0.0, min_visits=1,
-    )  # fmt: skip
+    how = {"depth": 6, "parts": 12, "reach_share": 2.0, "miss_share": 0.0, "min_visits": 1}
+    examined = jax.jit(partial(reachability.examine, displaced(*f32(np.zeros(1))), **how))
+    leaves = examined(f32([0.0], [16.0]), f32([-99.0], [99.0]), starts, seen)
     lower, upper, _ = used(leaves)
     assert len(lower) == 12
     assert (upper - lower).min() == 16 / 2**6

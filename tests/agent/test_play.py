@@ -1,6 +1,7 @@
 """The clocks of the levels, the moving subgoal and the statistics, against loops written from the equations."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -326,11 +327,12 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
 
 def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
     agent = loading.parse(tiny).hyper()
-    state = levels.init(agent, Spec.of(breaking_env.env), key=jax.random.key(0))
+    state = jax.jit(lambda key: levels.init(agent, Spec.of(breaking_env.env), key=key))(jax.random.key(0))
     roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
-    short, one = (
-        commander.settle(agent.commander, state.commander, roadmap, episode_length=steps).q for steps in (K - L, K)
+    settle = jax.jit(
+        partial(commander.settle, agent.commander, state.commander, roadmap), static_argnames="episode_length"
     )
+    short, one = (settle(episode_length=steps).q for steps in (K - L, K))
     assert np.asarray(one).any()
     np.testing.assert_array_equal(short, one)
 
@@ -339,7 +341,7 @@ def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
 def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(breaking_env, tiny, retry, trust):
     agent = loading.parse(tiny, {"commander.retry": retry, "commander.trust": trust, "commander.hold": False}).hyper()
     spec = replace(Spec.of(breaking_env.env), episode_length=40 * L)
-    state = levels.init(agent, spec, key=jax.random.key(0))
+    state = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
     n, rng = int(state.abstraction.count), np.random.default_rng(0)
     q, visits = rng.uniform(0, 1, state.commander.q.shape), rng.uniform(0, 9, state.commander.q.shape)
     led, rewards = rng.uniform(0, 9, state.commander.model.led.shape), visits * rng.uniform(0, 1, visits.shape)
@@ -355,7 +357,7 @@ def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(breaking_env, ti
     route = rng.integers(0, 3, (25, B))  # regions in which decisions are made
     succeeds = rng.random((25, B)) < 0.3
     playing = levels.of(agent, spec, greedy=True)
-    streams = play.start(playing, breaking_env, decisions=40, key=jax.random.key(2))
+    streams = jax.jit(lambda key: play.start(playing, breaking_env, decisions=40, key=key))(jax.random.key(2))
     seen, memory = scene_of(spec, streams.env), streams.memory
 
     @jax.jit

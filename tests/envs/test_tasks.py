@@ -59,7 +59,7 @@ def test_boxes_are_chosen_by_volume():
 def test_resets_use_the_goals_and_starts_of_the_options(name):
     env = envs.make(name, **({"engine": "native"} if name in ANT_TASKS else {}), goals="free", start="free")
     keys = jax.random.split(jax.random.key(0), 200)
-    obs = np.asarray(jax.vmap(env.reset)(keys).obs)
+    obs = np.asarray(jax.jit(jax.vmap(env.reset))(keys).obs)
     arena = env.arena
     for points in (obs[:, :2], obs[:, env.state_dim :][:, :2]):
         column, row = np.rint(points / arena.cell).astype(int).T
@@ -71,7 +71,7 @@ def test_resets_use_the_goals_and_starts_of_the_options(name):
 @pytest.mark.parametrize("name", ["point_maze", "point_2rooms", "point_maze_sparse"])
 def test_a_point_that_starts_anywhere_starts_clear_of_the_walls(name):
     env = envs.make(name, start="free", **({"cell": 1.5} if name == "point_2rooms" else {}))
-    x, y = np.asarray(jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 4000)).obs[:, :2]).T
+    x, y = np.asarray(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 4000)).obs[:, :2]).T
     for x_lo, y_lo, x_hi, y_hi in env.arena.walls():
         assert not ((x > x_lo - 0.499) & (x < x_hi + 0.499) & (y > y_lo - 0.499) & (y < y_hi + 0.499)).any()
 
@@ -79,7 +79,7 @@ def test_a_point_that_starts_anywhere_starts_clear_of_the_walls(name):
 def test_nobody_in_the_gap_is_near_a_goal():
     for options in ({"goals": "free"}, {"goals": "test"}):
         env = envs.make("ant_fall", engine="native", **options)
-        goals = np.asarray(jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 500)).obs[:, -3:])
+        goals = np.asarray(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 500)).obs[:, -3:])
         below = np.stack([goals[:, 0], np.clip(goals[:, 1], 12.3, 19.7), np.full(500, 0.8)], axis=1)
         assert (np.linalg.norm(goals - below, axis=1) > env.success_radius).all()
 
@@ -110,16 +110,16 @@ def test_cells_of_another_size_scale_x_and_y_and_leave_heights():
     env = envs.make("ant_fall", engine="native", cell=4.0, goals="test")
     assert [corner.tolist() for corner in env.space] == [[-2.0, -2.0, 0.0], [6.0, 14.0, 8.0]]
     assert env.region_cuts == ((2.0,), (8.0,), ()) and env.subgoal_scale == (5.0, 5.0, 0.5)
-    assert env.reset(jax.random.key(0)).obs[-3:].tolist() == [0.0, 13.5, 4.5]
+    assert jax.jit(env.reset)(jax.random.key(0)).obs[-3:].tolist() == [0.0, 13.5, 4.5]
     assert (env.arena.floor_height, env.success_radius) == (4.0, 2.5)
     assert TASKS["ant_maze_stochastic"].resized(2.0).block_noise == 0.25
 
 
 def test_sparse_reward_pays_success_and_only_that():
     env = envs.make("point_maze", reward="sparse", success_radius=2.0)
-    state = env.reset(jax.random.key(0))
+    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
     for goal, paid in (((0.0, 1.5), 1.0), ((0.0, 2.5), 0.0)):
-        after = env.step(state.replace(info={**state.info, "goal": jnp.array(goal)}), jnp.zeros(2))
+        after = step(state.replace(info={**state.info, "goal": jnp.array(goal)}), jnp.zeros(2))
         assert (float(after.reward), float(after.metrics["success"])) == (paid, paid)
         assert float(after.metrics["distance"]) == pytest.approx(goal[1], abs=0.2)
 
@@ -138,13 +138,13 @@ def test_rewards_of_arrays_are_those_of_single_goals():
 def test_noise_on_positions_has_the_given_size_and_is_off_by_default():
     def travelled(**options):
         env = envs.make("point_maze", **options)
-        states = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 500))
+        states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 500))
         still = states.replace(
             pipeline_state=states.pipeline_state.replace(
                 data=states.pipeline_state.data.replace(velocity=jnp.zeros((500, 2)))
             )
         )
-        step = jax.vmap(env.step)
+        step = jax.jit(jax.vmap(env.step))
         after = step(step(still, jnp.zeros((500, 2))), jnp.zeros((500, 2)))
         return np.asarray(after.obs[:, :2] - still.obs[:, :2])
 
@@ -162,9 +162,9 @@ def test_noise_moves_the_ant_too():
 
 def test_the_action_scale_multiplies_actions():
     point = envs.make("point_maze", action_scale=0.5)
-    state = point.reset(jax.random.key(0))
-    half = point.step(state, jnp.ones(2)).obs
-    np.testing.assert_allclose(half, envs.make("point_maze").step(state, 0.5 * jnp.ones(2)).obs, rtol=1e-6)
+    state = jax.jit(point.reset)(jax.random.key(0))
+    half = jax.jit(point.step)(state, jnp.ones(2)).obs
+    np.testing.assert_allclose(half, jax.jit(envs.make("point_maze").step)(state, 0.5 * jnp.ones(2)).obs, rtol=1e-6)
     ant = envs.make("ant_maze", engine="native", action_scale=2.0).body
     np.testing.assert_array_equal(ant.physics.model.actuator_ctrlrange, np.tile([-60.0, 60.0], (8, 1)))
 
@@ -185,7 +185,7 @@ IN_THE_GAP = {1: 16.0, 2: 0.75}
 )
 def test_a_flipped_or_fallen_ant_ends_the_episode_only_if_asked_and_stays_ended(option, name, place, how):
     env = envs.make("ant_fall", engine="native", **{option: how})
-    state = env.reset(jax.random.key(0))
+    state = jax.jit(env.reset)(jax.random.key(0))
     data = state.pipeline_state.data
     lost = data.replace(qpos=data.qpos.at[jnp.array([*place])].set(jnp.array([*place.values()])), qvel=0 * data.qvel)
     step = jax.jit(env.step)
@@ -203,16 +203,16 @@ def test_a_flipped_or_fallen_ant_ends_the_episode_only_if_asked_and_stays_ended(
 
 def test_dropped_contacts_end_the_episode_and_are_counted_once():
     env = envs.make("ant_maze", engine="native")
-    state = env.reset(jax.random.key(0))
+    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
     full = state.replace(
         pipeline_state=state.pipeline_state.replace(
             data=state.pipeline_state.data.replace(overflow=jnp.ones(()))  # native hands it on
         )
     )
-    after = env.step(full, jnp.zeros(8))
+    after = step(full, jnp.zeros(8))
     assert (float(after.done), float(after.info["truncation"]), float(after.metrics["overflow"])) == (1.0, 1.0, 1.0)
     np.testing.assert_array_equal(after.obs, state.obs)
-    assert float(env.step(after, jnp.zeros(8)).metrics["overflow"]) == 0.0
+    assert float(step(after, jnp.zeros(8)).metrics["overflow"]) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -221,20 +221,20 @@ def test_dropped_contacts_end_the_episode_and_are_counted_once():
 )
 def test_the_full_observation_appends_what_is_hidden(name, extra):
     env = envs.make(name, engine="native", observe="full")
-    state = env.reset(jax.random.key(0))
+    state = jax.jit(env.reset)(jax.random.key(0))
     data = state.pipeline_state.data
     assert env.state_dim == 30 + extra
     hidden = state.obs[30 : env.state_dim]
     flag = [0.0] if name == "ant_maze_cam" else []
     np.testing.assert_array_equal(hidden, np.concatenate([data.qpos[15:], data.qvel[14:], flag]))
-    plain = envs.make(name, engine="native").reset(jax.random.key(0))
+    plain = jax.jit(envs.make(name, engine="native").reset)(jax.random.key(0))
     np.testing.assert_array_equal(plain.obs[:30], state.obs[:30])
 
 
 def test_the_block_of_the_stochastic_maze_starts_elsewhere_every_time():
     env = envs.make("ant_maze_stochastic", engine="native")
     keys = jax.random.split(jax.random.key(0), 2000)
-    slid = np.asarray(jax.vmap(env.reset)(keys).pipeline_state.data.qpos)[:, 15]
+    slid = np.asarray(jax.jit(jax.vmap(env.reset))(keys).pipeline_state.data.qpos)[:, 15]
     assert stats.kstest(slid, "norm").pvalue > 1e-4
 
 

@@ -23,6 +23,10 @@ def stepper(vector):
     return jax.jit(vector.step)
 
 
+def begin(vector):
+    return jax.jit(vector.reset)(jax.random.key(0))
+
+
 def leaves(tree):
     """All leaves as numpy arrays, typed keys by their data."""
     arrays = (
@@ -44,7 +48,7 @@ def rollout(vector, state, actions):
 
 def test_finished_environments_begin_new_episodes_with_new_goals(env):
     vector = envs.VectorEnv(env, B)
-    state, step = vector.reset(jax.random.key(0)), stepper(vector)
+    state, step = begin(vector), stepper(vector)
     goals = [state.obs[:, env.state_dim :]]
     for _ in range(4):
         for _ in range(env.episode_length):
@@ -57,7 +61,7 @@ def test_finished_environments_begin_new_episodes_with_new_goals(env):
 
 def test_final_obs_flags_and_reward_are_those_of_the_finished_step(env):
     vector, plain = envs.VectorEnv(env, B), envs.VectorEnv(env, B, auto_reset=False)
-    state, expected = vector.reset(jax.random.key(0)), plain.reset(jax.random.key(0))
+    state, expected = begin(vector), begin(plain)
     step, plain_step = stepper(vector), stepper(plain)
     for seed in range(env.episode_length):
         state, expected = step(state, act(env, seed)), plain_step(expected, act(env, seed))
@@ -72,7 +76,7 @@ def test_final_obs_flags_and_reward_are_those_of_the_finished_step(env):
 
 def test_without_auto_reset_a_step_never_resets(env):
     vector = envs.VectorEnv(env, B, auto_reset=False)
-    state, step = vector.reset(jax.random.key(0)), stepper(vector)
+    state, step = begin(vector), stepper(vector)
     for _ in range(env.episode_length + 2):
         state = step(state, act(env))
         np.testing.assert_array_equal(state.info["final_obs"], state.obs)
@@ -83,8 +87,8 @@ def test_without_auto_reset_a_step_never_resets(env):
 def test_only_the_environments_that_finish_are_reset(env):
     vector = envs.VectorEnv(env, B)
     step = stepper(vector)
-    state = step(vector.reset(jax.random.key(0)), act(env))
-    state = vector.reset_where(state, jnp.array([True, False, False, False]), jax.random.key(1))
+    state = step(begin(vector), act(env))
+    state = jax.jit(vector.reset_where)(state, jnp.array([True, False, False, False]), jax.random.key(1))
     for _ in range(2):
         state = step(state, act(env))
     np.testing.assert_array_equal(state.done, [0.0, 1.0, 1.0, 1.0])
@@ -108,7 +112,7 @@ def test_reset_where_resets_everything_of_the_masked_and_nothing_else(name):
 
 
 def test_environments_of_a_batch_differ(env):
-    state = envs.VectorEnv(env, B).reset(jax.random.key(0))
+    state = begin(envs.VectorEnv(env, B))
     assert len(np.unique(state.obs, axis=0)) == B
 
 
@@ -158,7 +162,9 @@ def test_an_action_shared_by_all_seeds_is_broadcast(env):
 def test_typed_keys_are_carried_like_raw_ones(env):
     vector = envs.VectorEnv(env, B)
     ended = jnp.full((B, env.action_size), jnp.nan)  # ends every episode, so that the carried keys are used
-    typed, raw = (stepper(vector)(vector.reset(key), ended) for key in (jax.random.key(3), jax.random.PRNGKey(3)))
+    typed, raw = (
+        stepper(vector)(jax.jit(vector.reset)(key), ended) for key in (jax.random.key(3), jax.random.PRNGKey(3))
+    )
     np.testing.assert_array_equal(typed.done, np.ones(B))
     np.testing.assert_array_equal(typed.obs, raw.obs)
 
@@ -166,13 +172,15 @@ def test_typed_keys_are_carried_like_raw_ones(env):
 def test_a_key_for_each_environment_begins_the_episode_of_that_environment_alone(env):
     vector, single = envs.VectorEnv(env, B), envs.VectorEnv(env, 1)
     keys = jax.random.split(jax.random.key(0), B)
-    np.testing.assert_array_equal(vector.reset(keys).obs, vector.reset(jax.random.key(0)).obs)
-    np.testing.assert_array_equal(vector.reset(jax.random.key_data(keys)).obs, vector.reset(keys).obs)
+    reset, reset_one = jax.jit(vector.reset), jax.jit(single.reset)
+    begun = reset(keys)
+    np.testing.assert_array_equal(begun.obs, begin(vector).obs)
+    np.testing.assert_array_equal(reset(jax.random.key_data(keys)).obs, begun.obs)
     for i in range(B):
-        np.testing.assert_array_equal(vector.reset(keys).obs[i], single.reset(keys[i : i + 1]).obs[0])
-    state = vector.reset(jax.random.key(7))
+        np.testing.assert_array_equal(begun.obs[i], reset_one(keys[i : i + 1]).obs[0])
+    state = reset(jax.random.key(7))
     mask = jnp.arange(B) == 2
-    np.testing.assert_array_equal(vector.reset_where(state, mask, keys).obs[2], vector.reset(keys).obs[2])
+    np.testing.assert_array_equal(jax.jit(vector.reset_where)(state, mask, keys).obs[2], begun.obs[2])
     with pytest.raises(UserError, match=rf"the shape of the keys is \(2,\); allowed: one key, or \({B},\)"):
         vector.reset(keys[:2])
 
@@ -180,7 +188,7 @@ def test_a_key_for_each_environment_begins_the_episode_of_that_environment_alone
 @pytest.mark.parametrize("auto_reset", [True, False])
 def test_the_derivative_of_a_batch_is_that_of_each_environment(env, auto_reset):
     vector = envs.VectorEnv(env, B, auto_reset=auto_reset)
-    state, action = vector.reset(jax.random.key(0)), 0.5 * act(env)
+    state, action = begin(vector), 0.5 * act(env)
 
     def rewards(action):
         return vector.step(state, action).reward
@@ -201,10 +209,10 @@ def test_the_derivative_of_a_batch_is_that_of_each_environment(env, auto_reset):
 def test_an_engine_without_derivatives_says_so_in_one_line():
     env = envs.make("ant_maze", engine="native")
     vector = envs.VectorEnv(env, 2)
-    state = vector.reset(jax.random.key(0))
+    state = begin(vector)
     for function in (
         jax.grad(lambda a: vector.step(state, a).reward.sum()),
         jax.jacfwd(lambda a: vector.step(state, a).obs),
     ):
         with pytest.raises(UserError, match='engine: "native" has no derivatives; allowed: jax'):
-            function(jnp.zeros((2, 8)))
+            jax.eval_shape(function, jnp.zeros((2, 8)))

@@ -121,7 +121,7 @@ def test_a_step_of_expectation_maximisation_is_that_of_a_loop():
     ]
     blame = np.array(density) / np.sum(density, axis=0)
     before = mixtures.Mixture(*(jnp.asarray(x, jnp.float32) for x in (weights, means, covariances)))
-    after = mixtures.improve(before, jnp.asarray(points, jnp.float32), floor=0.1)
+    after = jax.jit(mixtures.improve)(before, jnp.asarray(points, jnp.float32), floor=0.1)
     for k in range(3):
         middle = np.average(points, axis=0, weights=blame[k])
         np.testing.assert_allclose(after.weights[k], blame[k].mean(), rtol=1e-3)
@@ -131,10 +131,10 @@ def test_a_step_of_expectation_maximisation_is_that_of_a_loop():
 
 
 def test_as_many_gaussians_are_fitted_as_there_are_clusters():
-    rng = np.random.default_rng(1)
+    rng, best_fit = np.random.default_rng(1), jax.jit(mixtures.best_fit, static_argnames="most")
     for centres in ([0.0], [-1.0, 1.0]):
         points = np.concatenate([rng.normal(centre, 0.2, (60, 1)) for centre in centres])
-        found = mixtures.best_fit(jnp.asarray(points, jnp.float32), most=2, key=jax.random.key(0))
+        found = best_fit(jnp.asarray(points, jnp.float32), most=2, key=jax.random.key(0))
         used = np.asarray(found.weights) > 0
         np.testing.assert_allclose(np.sort(np.asarray(found.means)[used, 0]), centres, atol=0.1)
 

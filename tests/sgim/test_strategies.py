@@ -83,7 +83,8 @@ def test_nothing_is_kept_where_everything_is_left_as_ever(tiny, breaking_env):
     spec = Spec.of(breaking_env.env)
 
     def kept(values):
-        return levels.init(loading.parse({**tiny, "sgim": values}).hyper(), spec, key=jax.random.key(0)).sgim
+        agent = loading.parse({**tiny, "sgim": values}).hyper()
+        return jax.eval_shape(lambda key: levels.init(agent, spec, key=key), jax.random.key(0)).sgim
 
     assert kept({}) is None
     for some in ({"goals": True}, {"exploration": True}, {"refinement": True}, {"teachers": [GUIDE]}):
@@ -340,8 +341,10 @@ def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
     alone = state.q[0, 1, 2]  # a waypoint tells nothing of what its region is worth
     roadmap = Roadmap(abstraction=None, allowed=allowed, believed=None)
 
+    observe = jax.jit(q_learning.observe)
+
     def learnt(shown, **margin):
-        return float(q_learning.observe(config, state, roadmap, decision.replace(shown=shown), **margin).q[0, 1, 2])
+        return float(observe(config, state, roadmap, decision.replace(shown=shown), **margin).q[0, 1, 2])
 
     assert learnt(None) == alone
     assert learnt(one(1.0), margin=0.2) == pytest.approx(float(alone) + 0.5 * (1.0 + 0.2 - float(alone)))
@@ -472,7 +475,7 @@ def test_sgim_follows_the_agent_through_its_epochs(schooled):
 
 def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env):
     agent, spec = loading.parse({**tiny, "sgim": {"goals": True}}).hyper(), Spec.of(breaking_env.env)
-    before = levels.init(agent, spec, key=jax.random.key(0))
+    before = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
     last = int(before.abstraction.count)
     cuts = [Cut(jnp.int32(15), jnp.int32(0), jnp.float32(9.0)), Cut(jnp.int32(last), jnp.int32(1), jnp.float32(5.0))]
     undone = Cut(jnp.int32(3), jnp.int32(0), jnp.float32(-2.0))
@@ -603,7 +606,7 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
 
 def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, breaking_env):
     agent, spec = loading.parse({**tiny, "sgim": {"teachers": [GUIDE]}}).hyper(), Spec.of(breaking_env.env)
-    state = levels.init(agent, spec, key=jax.random.key(0))
+    state = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
     i, j = map(
         int,
         np.argwhere(np.asarray(regions.adjacent(state.abstraction)) & ~np.eye(len(state.graph.told), dtype=bool))[0],
@@ -611,6 +614,7 @@ def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, bre
     nothing = jnp.zeros(3, jnp.int32)
     decision = Decision(*[nothing] * 3, *[jnp.zeros(3)] * 1, nothing, *[jnp.zeros(3)] * 5)
 
+    @jax.jit
     def value(told):
         graph = state.graph.replace(told=state.graph.told.at[i, j].set(told))
         roadmap = Roadmap.of(agent.commander, state.abstraction, graph)

@@ -44,6 +44,8 @@ PUSHED = 1e6
 SEEDS = [5, 6]
 
 counted = partial(faults.count, may_be_nan=STAR.may_be_nan)
+counted_of_seeds = jax.jit(jax.vmap(counted))
+copied = jax.jit(partial(jax.tree.map, jnp.copy))
 
 
 class Fragile(envs.VectorEnv):
@@ -181,11 +183,11 @@ class Rehearsal:
             signal.raise_signal(signal.SIGINT)
         rate = np.broadcast_to(hyper.controller.ppo.max_learning_rate, 2) / 1e-3
         self.rates.append((*rate.tolist(), *(np.asarray(state.controller.learning_rate) / 5e-4).tolist()))
-        after = jax.tree.map(jnp.copy, state).replace(epoch=state.epoch + 1)
+        after = copied(state).replace(epoch=state.epoch + 1)
         if number == self.broken and rate[1] > self.safe:
             after = poisoned("controller/params/log_std")(after)
         jax.tree.map(lambda leaf: leaf.delete(), state)
-        return after, jax.vmap(counted)(after)
+        return after, counted_of_seeds(after)
 
     def train(self, **how):
         said = io.StringIO()
@@ -199,7 +201,7 @@ class Rehearsal:
         with checkpoint.opened(self.run_dir) as saved:
             for step in saved.steps():
                 state = checkpoint.restore(program, saved, step, source=self.run_dir)
-                assert not any(int(x.sum()) for x in jax.vmap(counted)(state).values())
+                assert not any(int(x.sum()) for x in counted_of_seeds(state).values())
             return [step // EPOCH for step in saved.steps()]
 
     def journal(self, name):

@@ -7,6 +7,7 @@ import gzip
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -472,11 +473,14 @@ def test_a_numeric_hyperparameter_and_the_sinks_may_change_on_resume(finished, t
 
 
 def test_ctrl_c_writes_a_checkpoint_and_says_how_to_resume(tmp_path):
-    alone = {"sgim": {}, "commander": {"enabled": False, "period": 20}, "tutor": {"enabled": False, "unroll": 3}}
-    endless = {"total_env_steps": 10**9, "eval_every": 10**6, "sinks": []}  # TensorBoard's imports PyTorch
-    values = TINY | alone | {"trainer": TINY["trainer"] | endless}
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
-    command = [sys.executable, "-m", "star", "train", "config.yaml", "--run-dir", "run"]
+    """Of the experiment of `docs/experiments.md`, which compiles in a moment."""
+    (bandit,) = re.findall(
+        r'```python title="bandit.py"\n(.*?)```', (ROOT / "docs/experiments.md").read_text(), re.DOTALL
+    )
+    (tmp_path / "bandit.py").write_text(bandit)
+    endless = {"total_env_steps": 10**9, "eval_every": 10**6, "num_seeds": 2}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"experiment": "bandit:KIND", "trainer": endless}))
+    command = [sys.executable, "-m", "star", "train", "config.yaml", "--run-dir", "run", "--import", "bandit"]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
