@@ -114,7 +114,7 @@ YAW = {yaw: (np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)) for yaw in (-2.0, -1.01
 @pytest.fixture(scope="module")
 def cam():
     env = envs.make("ant_maze_cam", engine="native", observe="full")
-    return env, jax.jit(env.step)
+    return env, jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
 
 
 @pytest.mark.parametrize(
@@ -132,8 +132,7 @@ def cam():
     ],
 )
 def test_the_gate_of_the_ant_opens_exactly_on_its_condition(cam, x, y, yaw, opens):
-    env, step = cam
-    state = env.reset(jax.random.key(0))
+    env, state, step = cam
     data = state.pipeline_state.data
     qpos = data.qpos.at[0].set(x).at[1].set(y).at[2].set(3.0).at[3:7].set(jnp.array(YAW[yaw]))
     data = data.replace(qpos=qpos, qvel=jnp.zeros_like(data.qvel))
