@@ -180,7 +180,7 @@ def check_verdicts(config: AgentConfig, state: TrainState, *, points: int, seed:
 
 def _judge(config: AgentConfig, state: TrainState, pairs: jax.Array, share: jax.Array) -> Any:
     """The parts that the recursion ends with for each pair, and their hulls (low, high)."""
-    starts, seen = forward_model.visited(state.forward_model)
+    periods = forward_model.remembered(state.forward_model)
     settings = config.refinement
 
     def one(pair: jax.Array) -> Any:
@@ -191,8 +191,8 @@ def _judge(config: AgentConfig, state: TrainState, pairs: jax.Array, share: jax.
             network,
             (state.abstraction.lower[region], state.abstraction.upper[region]),
             wanted,
-            starts,
-            seen,
+            periods.start,
+            periods.weight,
             depth=settings.depth,
             parts=settings.parts,
             reach_share=share,

@@ -128,18 +128,18 @@ def train(
     return state.replace(params=params, optimizer=optimizer), {"loss": mean_loss}
 
 
-def visited(state: ForwardModelState) -> tuple[Float[Array, "N d"], Float[Array, "N"]]:
-    """Start states in the buffer and a mask of those that are real."""
+def remembered(state: ForwardModelState) -> Outcome:
+    """The periods [N] in the buffer; those that are not real weigh nothing."""
     items, written = replay.contents(state.ring)
-    return items.start, items.weight * written
+    return items.replace(weight=items.weight * written)
 
 
 def traffic(state: ForwardModelState, abstraction: Abstraction) -> Float[Array, "R R"]:
     """How many of the periods in the buffer began in each region (row) and ended in each (column)."""
-    items, written = replay.contents(state.ring)
-    began, ended = (regions.locate(abstraction, point) for point in (items.start, items.end))
+    periods = remembered(state)
+    began, ended = (regions.locate(abstraction, point) for point in (periods.start, periods.end))
     none = jnp.zeros((abstraction.capacity, abstraction.capacity))
-    return none.at[began, ended].add(items.weight * written)
+    return none.at[began, ended].add(periods.weight)
 
 
 def _scaling(space: Float[Array, "2 d"]) -> tuple[Array, Array]:

@@ -15,6 +15,9 @@ With `within`, pairs (i, i) are examined too: does a region reach the goals insi
 in i whose goal lies in i. One of their goals is drawn, if possible one that was reached, and the square inside its
 circle of success is the box to reach. Only cuts come of it, no verdicts, since the next goal may be another one.
 
+With `separate`, regions are cut besides where agents move on both sides of a plane and nobody passes it
+(star/abstraction/passages.py).
+
 Source: STAR (ICLR 2024), section 4.3 and algorithm 2.
 """
 
@@ -29,13 +32,15 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from envs.common.batching import where
-from star.abstraction import forward_model, reachability, regions
+from star.abstraction import forward_model, passages, reachability, regions
 from star.abstraction.forward_model import ForwardModelState, Outcome
 from star.abstraction.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves
 from star.abstraction.regions import Abstraction, Change, Cut, Split
 from star.abstraction.sections import AbstractionConfig, ForwardModelConfig, RefinementConfig
 
 Metrics = dict[str, Array]
+
+_SEPARATED = 8  # regions an epoch that may be cut where nobody passes
 
 
 class Settings(Protocol):
@@ -232,10 +237,10 @@ def refine(
 
     `cube` is `Spec.cube`. Of the due pairs, those commanded most and waiting longest come first; `weight` multiplies
     the urgency of those that lead to each region. Returns the graph of the new regions, and the change that tables
-    indexed by region have to follow, with [pairs_per_epoch * cuts_per_pair] splits.
+    indexed by region have to follow, with [pairs_per_epoch * cuts_per_pair] splits and those where nobody passes.
     """
     graph, before = forget(config, graph), abstraction
-    starts, seen = forward_model.visited(model)
+    periods = forward_model.remembered(model)
 
     def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
         abstraction, graph = carry
@@ -244,7 +249,7 @@ def refine(
         goal_key, cut_key = jax.random.split(pair_key)
         commanded, wanted, there = _boxes(abstraction, region, target, goals, cube=cube, key=goal_key)
         judged = found & there
-        leaves = _examine(config, abstraction, model, region, commanded, wanted, starts, seen)
+        leaves = _examine(config, abstraction, model, region, commanded, wanted, periods.start, periods.weight)
         verdict = reachability.summary(leaves)
         graph = graph.replace(
             age=graph.age.at[region, target].set(jnp.where(found, 0, graph.age[region, target])),
@@ -268,15 +273,41 @@ def refine(
         one_pair, (abstraction, graph), jax.random.split(key, config.refinement.pairs_per_epoch)
     )
     splits = jax.tree.map(lambda x: x.reshape(-1), splits)
+    separated = jnp.zeros((), jnp.int32)
+    if config.refinement.separate:
+        abstraction, graph, more = _separate(config, abstraction, graph, periods)
+        splits, separated = jax.tree.map(lambda *both: jnp.concatenate(both), splits, more), more.done.sum()
     metrics = {
         "examined": found.sum(),
         "mixed": mixed.sum(),
         "splits": splits.done.sum(),
+        "separated": separated,
         "edges": graph.reaches.sum(),
         "misses": graph.misses.sum(),
         "table_full": (abstraction.count == abstraction.capacity).astype(jnp.int32),
     }
     return graph, Change.of(before, abstraction, splits), metrics
+
+
+def _separate(
+    config: Settings, abstraction: Abstraction, graph: Graph, periods: Outcome
+) -> tuple[Abstraction, Graph, Split]:
+    """Cut regions where nobody passes, those first in which most move on either side."""
+    min_width = config.abstraction.min_width
+    cuts, evidence = passages.cuts(abstraction, periods, min_width=min_width)
+    worst = jnp.argsort(-evidence)[:_SEPARATED]
+
+    def one(carry: tuple[Abstraction, Graph], chosen: tuple[Cut, Array]) -> tuple[tuple[Abstraction, Graph], Split]:
+        abstraction, graph = carry
+        cut, evidence = chosen
+        after, possible = regions.split(abstraction, cut, min_width=min_width)
+        child = jnp.minimum(abstraction.count, abstraction.capacity - 1)
+        split = Split(done=possible & (evidence > 0), cut=cut, child=child)
+        return (where(split.done, after, abstraction), on_split(graph, split)), split
+
+    chosen = jax.tree.map(lambda x: x[worst], (cuts, evidence))
+    (abstraction, graph), splits = jax.lax.scan(one, (abstraction, graph), chosen)
+    return abstraction, graph, splits
 
 
 def _most_urgent(

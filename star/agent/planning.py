@@ -242,8 +242,8 @@ def _inherited(
     Nobody knows any more which command led from where to where within the regions of then. But how many periods led
     from each part into each is known by `traffic`, and by that the counts are shared out: nothing leads through a wall
     where nothing ever did. What began in a part is but a belief in what happens there, of `section.prior` decisions at
-    most, as are rewards where the goal may have been in a part. What aiming at the goal paid tells nothing of aiming
-    at a part in which the goal is not.
+    most, as is what aiming at the goal pays in its own part. What goals elsewhere paid is forgotten: nobody knows in
+    which part they were, and one success in fifteen, believed of the wrong part, holds agents before a wall.
     """
     pair, cube = jnp.ix_(origin, origin), jnp.ix_(origin, origin, origin)
     together = partial(regions.over_parts, origin=origin)
@@ -252,7 +252,8 @@ def _inherited(
     began = traffic.sum(axis=1)
     of_part = jnp.where(cut, began / jnp.maximum(together(began), 1.0), 1.0)
     led, lost = earlier.led[:, *cube] * share[:, None], earlier.lost[:, *pair] * of_part[:, None]
-    kept = jnp.where(_beside(origin), 0.0, of_part[:, None, None])
+    elsewhere = (cut[:, None] | cut) & ~jnp.eye(len(origin), dtype=bool)
+    kept = jnp.where(elsewhere[..., None] | _beside(origin), 0.0, of_part[:, None, None])
     rewards, visits = earlier.rewards[cube] * kept, earlier.visits[cube] * kept
 
     doubt = lambda number: section.prior / jnp.maximum(number, section.prior)  # noqa: E731

@@ -88,7 +88,7 @@ def test_training_learns_where_each_commanded_box_leads(train):
     assert np.isfinite(metrics["loss"])
 
 
-def test_outcomes_of_weight_0_teach_nothing_and_were_not_visited(train):
+def test_outcomes_of_weight_0_teach_nothing_and_are_not_remembered(train):
     chosen = settings()
     state = forward_model.init(jax.random.key(0), chosen, space=SPACE)
     half = np.arange(16) % 2
@@ -96,14 +96,16 @@ def test_outcomes_of_weight_0_teach_nothing_and_were_not_visited(train):
     garbage = batch.replace(end=np.where(half[:, None] > 0, batch.end, 1e6).astype(np.float32))
     (first, _), (second, _) = (train(chosen, state, b, jax.random.key(1)) for b in (batch, garbage))
     jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
-    starts, seen = forward_model.visited(first)
-    assert starts.shape == (32, 2)
-    np.testing.assert_array_equal(np.asarray(starts)[np.asarray(seen) > 0], batch.start[half > 0])
+    periods = forward_model.remembered(first)
+    assert periods.start.shape == (32, 2)
+    for name in ("start", "end"):
+        real = np.asarray(getattr(periods, name))[np.asarray(periods.weight) > 0]
+        np.testing.assert_array_equal(real, getattr(batch, name)[half > 0])
 
 
-def test_nothing_was_visited_before_the_first_outcome():
+def test_nothing_is_remembered_before_the_first_outcome():
     state = forward_model.init(jax.random.key(0), settings(), space=SPACE)
-    assert float(forward_model.visited(state)[1].sum()) == 0
+    assert float(forward_model.remembered(state).weight.sum()) == 0
 
 
 def test_traffic_counts_the_remembered_periods_between_regions(train):

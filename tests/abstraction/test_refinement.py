@@ -21,6 +21,7 @@ SPACE = ((-4.0, -4.0), (20.0, 20.0))
 
 def settings(**values):
     refine = {"min_transitions": 10, "min_visits": 5, "depth": 3, "pairs_per_epoch": 1, "miss_lifetime": 2}
+    refine |= {"separate": False}
     # `min_width` and the like are traced, so overrides of floats compile nothing.
     model = {"hidden": [4], "buffer_size": 2000}
     values = {f"refinement.{key}": value for key, value in refine.items()} | values
@@ -381,6 +382,28 @@ def test_only_targets_that_touch_a_region_cut_it_if_told_so(refine, moving, targ
     _, graph, _, metrics = refine(CONFIG, grid(), knowing((0, target)), moving(by))  # regions 0 and 3 share a corner
     assert int(metrics["splits"]) == cuts
     assert int(graph.verdict[0, target]) == UNKNOWN  # agents have been all over the region, and only a part reaches
+
+
+def test_a_region_is_cut_besides_where_nobody_passes_and_the_graph_follows(refine, moving):
+    """Agents stay in the corner of [-4, 8)^2 in which they are."""
+    model = moving((0, 0))
+    start = jax.random.uniform(jax.random.key(2), (2000, 2), minval=-4.0, maxval=8.0)
+    end = jnp.where(start[:, :1] < 2, jnp.array([-3.0, 2.0]), jnp.array([7.0, 2.0]))
+    items, _ = replay.contents(model.ring)
+    periods = items.replace(start=start, end=end, weight=jnp.ones(2000))
+    model = model.replace(ring=replay.add(model.ring, periods))
+    graph = random_graph(1)
+    never = settings(**{"refinement.min_transitions": 1000})
+    after, _, splits, metrics = refine(never, grid(), graph, model)
+    assert int(after.count) == 4 and int(metrics["separated"]) == 0 == int(splits.done.sum())
+    chosen = settings(**{"refinement.min_transitions": 1000, "refinement.separate": True})
+    after, told, splits, metrics = refine(chosen, grid(), graph, model)
+    assert int(metrics["separated"]) == 1 == int(splits.done.sum()) and int(metrics["splits"]) == 1
+    assert int(after.count) == 5
+    new = [np.asarray(corner)[4].tolist() for corner in (after.lower, after.upper)]
+    assert new == [[pytest.approx(2.0, abs=12 / 32), -4.0], [8.0, 8.0]]
+    assert (np.asarray(told.verdict)[:, [0, 4]] == UNKNOWN).all()
+    assert (np.asarray(told.transitions)[[0, 4]] == 0).all()
 
 
 def test_an_examined_pair_may_make_several_cuts(refine, moving):
