@@ -3,8 +3,9 @@
 >>> import envs
 >>> env = envs.VectorEnv(envs.make("point_maze"), 64)
 
-`envs` knows nothing of agents. See docs/environments.md for every task, option and convention. What needs JAX is
-imported when it is first used. Where Gymnasium is installed, its ids of the tasks are registered (docs/gymnasium.md).
+`envs` knows nothing of agents. See docs/environments.md for every task, option and convention, and docs/your_robot.md
+for environments of your own. What needs JAX is imported when it is first used. Where Gymnasium is installed, its ids of
+the tasks are registered (docs/gymnasium.md).
 """
 
 from __future__ import annotations
@@ -21,13 +22,42 @@ if importlib.util.find_spec("gymnasium"):
     from envs import registration as registration
 
 if TYPE_CHECKING:
+    from envs.arena import Arena, read_arena
     from envs.build import make
-    from envs.maze import MazeEnv
+    from envs.goal_env import GoalEnv, adapt
+    from envs.maze import Body, MazeEnv
+    from envs.physics import Physics
+    from envs.robot import Robot
     from envs.vector import VectorEnv
 
-__all__ = ["EnvError", "MazeEnv", "UserError", "VectorEnv", "make", "names"]
+__all__ = [
+    "Arena",
+    "Body",
+    "EnvError",
+    "GoalEnv",
+    "MazeEnv",
+    "Physics",
+    "Robot",
+    "UserError",
+    "VectorEnv",
+    "adapt",
+    "make",
+    "names",
+    "read_arena",
+]
 
-_HOMES = {"make": "envs.build", "MazeEnv": "envs.maze", "VectorEnv": "envs.vector"}
+_HOMES = {
+    "Arena": "envs.arena",
+    "Body": "envs.maze",
+    "GoalEnv": "envs.goal_env",
+    "MazeEnv": "envs.maze",
+    "Physics": "envs.physics",
+    "Robot": "envs.robot",
+    "VectorEnv": "envs.vector",
+    "adapt": "envs.goal_env",
+    "make": "envs.build",
+    "read_arena": "envs.arena",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -140,7 +140,7 @@ class Arena:
         return (corners - 0.5) * self.cell
 
 
-def read(source: str, *, cell: float) -> Arena:
+def read_arena(source: str, *, cell: float) -> Arena:
     """The arena of a user's map: the path of a file, or what would be in it if `source` has several lines.
 
     It is either the rows as plain text, or YAML with the rows as a block of text under `map` and, if wanted, `cell`
@@ -164,7 +164,7 @@ def read(source: str, *, cell: float) -> Arena:
 
 
 def load(source: str) -> str:
-    """The text of a map given as `read` takes it; raises `EnvError` if there is no such file."""
+    """The text of a map given as `read_arena` takes it; raises `EnvError` if there is no such file."""
     if "\n" in source.strip():
         return source
     try:

@@ -22,8 +22,9 @@ from flax import struct
 
 from envs._quiet import Env, State
 from envs.arena import Arena
+from envs.options import EnvError, known
 from envs.places import Places
-from envs.tasks import Switch, Task
+from envs.tasks import ENDS, Switch, Task, on_map
 
 
 class Body(Protocol):
@@ -126,6 +127,68 @@ class MazeEnv(Env):
         self._ends = {"flipped": flip, "fallen": fall}
         self._position_noise = position_noise
 
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        body: Body,
+        arena: Arena,
+        *,
+        goals: str = "train",
+        start: str = "task",
+        episode_length: int = 500,
+        reward: str = "distance",
+        success_radius: float | None = None,
+        clearance: float = 1.0,
+        flip: str = "ignore",
+        fall: str = "ignore",
+    ) -> MazeEnv:
+        """A body of the user's own in an arena of theirs.
+
+        Args:
+          name: what it is called in pictures.
+          body: what moves, such as a `Robot`. Its position (x, y) comes first in its state.
+          arena: where it moves, see `read_arena`.
+          goals: `train`, anywhere in the free cells; `test`, the cells marked `g` or the one that is farthest away.
+          start: `task`, the cells marked `r`; `free`, anywhere.
+          episode_length: env steps.
+          reward: `distance`, minus the distance to the goal (m); `sparse`, 1 for success and else 0.
+          success_radius: m; None is 5/8 of a cell.
+          clearance: m that starts and goals keep from the sides of a cell.
+          flip: what ends an episode where the body lies on its back: `ignore` (nothing), `terminate`, `truncate`.
+          fall: the same where it lies in a gap of the floor.
+
+        Raises:
+          EnvError: in one line, for a value that is not allowed.
+
+        """
+        task = on_map("", arena, clearance=clearance)
+        for what, word, words in (
+            ("goals", goals, task.goals),
+            ("start", start, task.starts),
+            ("reward", reward, ("distance", "sparse")),
+            ("flip", flip, ENDS),
+            ("fall", fall, ENDS),
+        ):
+            if word not in words:
+                raise EnvError(f"{name}: {what} is {word!r}; {known(str(word), words)}")
+        radius = task.success_radius if success_radius is None else success_radius
+        for what, number in (("episode_length", episode_length), ("success_radius", radius)):
+            if not number > 0:
+                raise EnvError(f"{name}: {what} is {number!r}; allowed: a number above 0")
+        return cls(
+            name,
+            task,
+            body,
+            goals=goals,
+            start=start,
+            episode_length=episode_length,
+            reward=reward,
+            success_radius=radius,
+            flip=flip,
+            fall=fall,
+        )
+
     @property
     def observation_size(self) -> int:
         """Length of an observation: the state and the desired goal."""
@@ -145,6 +208,11 @@ class MazeEnv(Env):
     def backend(self) -> str:
         """Brax's word for the engine."""
         return self.engine
+
+    @property
+    def walls(self) -> np.ndarray:
+        """Merged wall rectangles [n, 4] as (x_lo, y_lo, x_hi, y_hi), in m."""
+        return self.arena.walls()
 
     @property
     def body(self) -> Body:

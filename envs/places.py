@@ -8,8 +8,6 @@ from envs.arena import FREE, GOAL, ROBOT, Arena
 
 Point = tuple[float, ...]
 
-CLEARANCE = {"ant": 1.0, "point": 0.6}  # m that a body keeps from the sides of a cell when it starts anywhere
-
 
 @dataclass(frozen=True)
 class Places:
@@ -60,6 +58,6 @@ def around(arena: Arena, symbols: str, *, clearance: float, height: Point = ()) 
     )
 
 
-def anywhere(body: str, arena: Arena) -> Places:
-    """Anywhere in the free cells, clear of their sides."""
-    return around(arena, FREE + ROBOT + GOAL, clearance=CLEARANCE[body])
+def anywhere(arena: Arena, *, clearance: float) -> Places:
+    """Anywhere in the free cells, `clearance` m from their sides."""
+    return around(arena, FREE + ROBOT + GOAL, clearance=clearance)

@@ -20,6 +20,8 @@ INTEGRATORS = ("implicitfast", "euler", "rk4")
 SOLVERS = ("newton", "cg")
 CONES = ("pyramidal", "elliptic")
 ENGINES = ("auto", "native", "jax", "warp")
+ENDS = ("ignore", "terminate", "truncate")  # what a mishap may do to the episode
+CLEARANCE = {"ant": 1.0, "point": 0.6}  # m that a body keeps from the sides of a cell when it starts anywhere
 
 # `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
 # MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both.
@@ -79,6 +81,7 @@ class Task:
     `goals` names the distributions of the desired goal, the first being the default; `starts` those of the body's
     position (x, y). `block_noise` is the standard deviation, in m, of a block's start along x. `defaults` are
     options whose default is not the usual one, `maps` tells whether a map of the user's own may take the row's place.
+    `clearance` is what the body keeps from the sides of a cell where it may start anywhere, in m.
     """
 
     body: str
@@ -87,6 +90,7 @@ class Task:
     success_radius: float
     goals: Mapping[str, Places]
     starts: Mapping[str, Places]
+    clearance: float
     switch: Switch | None = None
     block_noise: float = 0.0
     defaults: Mapping[str, Any] = field(default_factory=dict)
@@ -95,7 +99,7 @@ class Task:
     def resized(self, cell: float) -> Task:
         """The task with cells of `cell` m; heights stay."""
         ratio, arena = cell / self.arena.cell, arenas.resized(self.arena, cell)
-        before, after = anywhere(self.body, self.arena), anywhere(self.body, arena)  # their clearance does not scale
+        before, after = (anywhere(one, clearance=self.clearance) for one in (self.arena, arena))  # it does not scale
 
         def follow(places: Places) -> Places:
             return after if places == before else places.resized(ratio)
@@ -139,8 +143,8 @@ COMMON: Mapping[str, Option] = {
 }
 
 ANT: Mapping[str, Option] = {
-    "flip": choice("ignore", "terminate", "truncate"),
-    "fall": choice("ignore", "terminate", "truncate"),
+    "flip": choice(*ENDS),
+    "fall": choice(*ENDS),
     "preset": choice(*PRESETS),
     "collisions": choice("all", "feet"),
     "timestep": duration(0.02, 1.0),
@@ -179,6 +183,7 @@ def maze(
     goals: Mapping[str, Places] | None = None,
     geometry: Geometry | None = None,
     success_radius: float | None = None,
+    clearance: float | None = None,
     **columns: Any,
 ) -> Task:
     """A row over x and y. Unless told otherwise, goals and success are as on a map of the user's own.
@@ -186,7 +191,8 @@ def maze(
     Training goals lie anywhere in the free cells. Test goals are the cells marked `g`, else the free cell that is
     the longest walk away. Success is within 5/8 of a cell.
     """
-    free = anywhere(body, arena)
+    clearance = CLEARANCE[body] if clearance is None else clearance
+    free = anywhere(arena, clearance=clearance)
     if goals is None:
         goals = {"train": free, "test": marked_goals(arena)}
     return Task(
@@ -196,6 +202,7 @@ def maze(
         success_radius=0.625 * arena.cell if success_radius is None else success_radius,
         goals={**goals, "free": goals.get("free", free)},
         starts={"task": centres(arena, ROBOT), "free": free},
+        clearance=clearance,
         **columns,
     )
 
@@ -203,24 +210,39 @@ def maze(
 def own(body: str, source: str, *, cell: float | None) -> Task:
     """The row of a map of the user's own, with cells of `cell` m or else of the map's size, or 8 m.
 
-    On a map with a gap goals lie at the centres of cells and success is within 3/8 of a cell, out of the gap's reach.
-
     Raises:
       EnvError: if the map is malformed, or holds what `body` can do nothing with.
     """
-    arena = arenas.read(source, cell=8.0)
-    strange = {GATE: "a gate, which no map says how to open"}
+    arena = arenas.read_arena(source, cell=8.0)
     if body == "point":
-        strange |= {BLOCK: "a block, which the point cannot push", CHASM: "a gap, which the point cannot fall into"}
-    for r, c in arena.cells("".join(strange)):
-        raise EnvError(f"map: row {r + 1}, column {c + 1} is {strange[arena.rows[r][c]]}")
+        _refuse(
+            arena, {BLOCK: "a block, which the point cannot push", CHASM: "a gap, which the point cannot fall into"}
+        )
     if cell is not None:
         arena = arenas.resized(arena, cell)
+    return on_map(body, arena, clearance=CLEARANCE[body])
+
+
+def on_map(body: str, arena: Arena, *, clearance: float) -> Task:
+    """The row of an arena of the user's own.
+
+    On a map with a gap goals lie at the centres of cells and success is within 3/8 of a cell, out of the gap's reach.
+
+    Raises:
+      EnvError: if the arena holds what nobody can do anything with.
+    """
+    _refuse(arena, {GATE: "a gate, which no map says how to open"})
     if not arena.floor_height:
-        return maze(body, arena, maps=True)
+        return maze(body, arena, clearance=clearance, maps=True)
     goals = {"train": centres(arena, FREE + ROBOT + GOAL), "test": marked_goals(arena)}
     goals["free"] = goals["train"]
-    return maze(body, arena, goals=goals, success_radius=0.375 * arena.cell, maps=True)
+    return maze(body, arena, goals=goals, success_radius=0.375 * arena.cell, clearance=clearance, maps=True)
+
+
+def _refuse(arena: Arena, strange: Mapping[str, str]) -> None:
+    """Raise `EnvError` if `arena` has a cell that holds one of `strange`, symbols and what they stand for."""
+    for r, c in arena.cells("".join(strange)):
+        raise EnvError(f"map: row {r + 1}, column {c + 1} is {strange[arena.rows[r][c]]}")
 
 
 # The published tasks (star.md of the paper's experiments): 8 m cells, success within 5 m.

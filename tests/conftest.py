@@ -149,7 +149,7 @@ def compiled_once():
 
 def compiled(config):
     """The structure of `config`, whatever the loop around its program does; None if it depends on files."""
-    if config.experiment != "star":
+    if config.experiment != "star" or ":" in config.env.name:
         return None
     learners = any(":" in level.learner for _, level, _ in config.learners())
     if learners or any(teacher.source != "map" for teacher in config.sgim.teachers):

@@ -32,7 +32,7 @@ from envs.common import reading
 from envs.common.errors import UserError
 from star import cli, sgim
 from star.abstraction import regions
-from star.agent.experiment import make_env
+from star.agent import environment
 from star.cli.streams import unbroken
 from star.cli.words import new_place, split_settings
 from star.config import plugins
@@ -339,7 +339,7 @@ def test_a_run_knows_its_teachers_file_by_its_checksum(tmp_path):
     assert list(differences(parse(before), resolved)) == []
     np.savez(source, format=np.int32(1))
     with pytest.raises(UserError, match=f"is not the file that the run began with; its SHA-256 was {noted}"):
-        teachers.load(source, env="point_maze", spec=Spec.of(make_env(config, "test")), sha256=noted)
+        teachers.load(source, env="point_maze", spec=Spec.of(environment.make(config, "test")), sha256=noted)
 
 
 @pytest.mark.parametrize("kind", ["rbg", "unsafe_rbg"])

@@ -30,7 +30,7 @@ import jax
 
 from envs.vector import VectorEnv
 from star import cli, devices
-from star.agent.experiment import make_env
+from star.agent import environment
 from star.config.loading import load
 from star.training import program as programs
 from star.training.profiling import timed
@@ -109,7 +109,7 @@ def physics(program: Program, repeats: int) -> list[float]:
     """Seconds of loops of the environments alone, as they are shared out in `program`."""
     config = program.config.trainer
     mesh = devices.mesh(config.devices)
-    env = make_env(program.config, "train")
+    env = environment.make(program.config, "train")
     batch = VectorEnv(env, config.num_envs * config.num_seeds, auto_reset=False)
 
     def begin(key: jax.Array) -> Any:

@@ -30,9 +30,8 @@ import numpy as np
 from envs.vector import VectorEnv
 from star.abstraction import forward_model
 from star.abstraction.reachability import MISSES, REACHES
-from star.agent import levels, play
+from star.agent import environment, levels, play
 from star.agent.decisions import Decision, Roadmap, Successors
-from star.agent.experiment import make_env
 from star.agent.sections import AgentConfig
 from star.agent.state import TrainState
 from star.config.loading import load_run
@@ -147,7 +146,7 @@ def main() -> None:
     program = programs.build(config)
     step, states = load_state(program, options.run, options.checkpoint)
     agent, spec = program.config.hyper(), program.experiment.spec
-    task = make_env(program.config, "train", start=options.start)
+    task = environment.make(program.config, "train", start=options.start)
     env = VectorEnv(task, options.episodes, auto_reset=False)
     roll = jax.jit(partial(rollouts, agent, spec, env))
     keys = program.evaluation_keys(options.seed, stream=programs.AFTERWARDS)

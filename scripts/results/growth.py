@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from star.agent import figures
-from star.agent.experiment import make_env
+from star.agent import environment, figures
 from star.config.loading import load_run
 from star.training.figures import save
 from star.training.journal import Journal
@@ -33,7 +32,7 @@ def main() -> None:
     rows = [row for row in rows if options.seed in (None, row["seed"])]
     if not rows:
         parser.error(f"{options.run}: holds no regions.jsonl with rows of the seed asked for")
-    walls = make_env(load_run(options.run, {"env.engine": "auto"}), "test").arena.walls()
+    walls = environment.make(load_run(options.run, {"env.engine": "auto"}), "test").walls
     out = options.out or options.run / "figures" / "growth.png"
     moments = options.at and [*options.at, np.inf]
     save(figures.growth_figure(regions=rows, walls=np.asarray(walls), moments=moments), out)

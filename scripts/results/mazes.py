@@ -55,7 +55,7 @@ def with_ends(grid: Grid, *, cell: float) -> tuple[str, float]:
     """The map with its start and goal, and the length of the shortest way between them, in m."""
     started = [row[:] for row in grid]
     started[1][1] = "r"
-    found = arena.read("\n".join(map("".join, started)), cell=cell)
+    found = arena.read_arena("\n".join(map("".join, started)), cell=cell)
     goal = np.array([arena.farthest(found)])
     row, column = found.cell_at(goal[0])
     started[row][column] = "g"

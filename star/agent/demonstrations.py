@@ -13,7 +13,7 @@ from flax import struct
 from rich.console import Console
 
 from envs.vector import VectorEnv
-from star.agent.experiment import make_env
+from star.agent import environment
 from star.agent.play import greedy
 from star.agent.sections import Config
 from star.config.section import ConfigError
@@ -69,7 +69,7 @@ def play(
 ) -> tuple[Moments, Spec]:
     """Greedy episodes on training goals, as NumPy arrays [T + 1, E, ...]; at the last moment nothing is done."""
     program, state, key = load_agent(config, run_dir, checkpoint=checkpoint, agent=agent, seed=seed)
-    vector = VectorEnv(make_env(program.config, "train"), episodes, auto_reset=False)
+    vector = VectorEnv(environment.make(program.config, "train"), episodes, auto_reset=False)
     spec = program.experiment.spec
 
     def look(env_state: Any) -> Moments:

@@ -19,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from envs import routes
+from envs import goal_env, routes
 from envs.common import modes
 from envs.vector import VectorEnv
+from star.agent import environment
 from star.agent.episodes import MEASURES, Trials, summarise, summarise_way
-from star.agent.experiment import make_env
 from star.agent.play import Episode, greedy
 from star.agent.sections import Config
 from star.config.loading import parse
@@ -89,10 +89,11 @@ def prepare(config: Config, exam: Exam, *, episodes: int, source: Path) -> Cours
     """
     program = programs.build(config)
     task = elsewhere(config, exam.task)
-    env = make_env(task, "test")
+    env = environment.make(task, "test")
     spec = _fitting(program, env, source=source)
     goals = cells = None
     if exam.grid is not None:
+        goal_env.need(env, "--goals grid", "with_goal", "arena")
         cells = env.arena.grid(exam.grid)
         if not len(cells):
             raise ConfigError(f"--grid: {exam.grid} puts no goal on a free floor of {env.name}")
@@ -258,6 +259,8 @@ def shortest_ways(course: Course, trials: Trials) -> np.ndarray | None:
 
     None where the map alone does not tell, see `envs.routes.distances`.
     """
+    if course.env.arena is None:
+        return None
     starts = np.asarray(trials.start)[..., _xy(course.spec.abstract_indices)].reshape(-1, 2)
     goals = np.asarray(trials.goal)[..., _xy(course.spec.goal_indices)].reshape(-1, 2)
     found = routes.distances(course.env.arena, starts, goals)
@@ -296,7 +299,7 @@ def _row(entry: _Entry, exam: Exam, trials: Trials, shortest: np.ndarray | None)
                 f"{measure}_above": statistics.above(scores),
             }
     if course.cells is not None:
-        row |= {"per_goal": per_goal(course.cells, trials), "walls": course.env.arena.walls().tolist()}
+        row |= {"per_goal": per_goal(course.cells, trials), "walls": course.env.walls.tolist()}
     return row | {"seeds": per_seed}
 
 

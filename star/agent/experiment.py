@@ -10,13 +10,12 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-import envs
-from envs import arena
+from envs import arena, goal_env
 from envs.common import files, modes, reading
 from envs.options import normal
 from envs.vector import VectorEnv
 from star import devices, learners
-from star.agent import checks, levels, memory, play, region_rows
+from star.agent import checks, environment, levels, memory, play, region_rows
 from star.agent import epoch as learning
 from star.agent.episodes import summarise
 from star.agent.play import Episode
@@ -40,15 +39,17 @@ class Star(Experiment):
     """Three levels in an environment."""
 
     def __init__(self, config: Config) -> None:
-        env, test_env = (make_env(config, goals) for goals in ("train", "test"))
+        env, test_env = (environment.make(config, goals) for goals in ("train", "test"))
         self.spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
         """What the levels know of the environment."""
-        super().__init__(resolve(config, env.engine, self.spec))
+        super().__init__(resolve(config, environment.engine_of(config, env), self.spec))
         config = self.config
         try:
             checks.check(config, self.spec)
         except ValueError as error:
             raise ConfigError(str(error)) from None
+        if config.sgim.enabled:
+            goal_env.need(env, "SGIM", "with_goal")
         self.env, self.test_env = env, test_env
         self._trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
         surplus = -config.trainer.eval_episodes % config.trainer.devices  # each device plays as many
@@ -60,7 +61,7 @@ class Star(Experiment):
                 f"{self._on_test.episode_length}"
             )
         self.steps_per_epoch = config.trainer.num_envs * self.spec.episode_length
-        self.walls = np.asarray(env.arena.walls())
+        self.walls = np.asarray(env.walls)
         self.goal = _a_goal(self.spec, test_env)
         """A test goal as an abstract point [d]: the one of the task, or one of several."""
 
@@ -167,21 +168,10 @@ def _checksum(source: str) -> str | None:
         return None
 
 
-def make_env(config: Config, goals: str, **others: Any) -> Any:
-    """The task of `config`: on its test goals with "test", as for training with "train"; `others` are options too."""
-    if goals == "train":
-        options = {"goals": goals} | config.env.options | config.env.training | others
-    else:
-        options = config.env.options | {"goals": goals} | others
-    try:
-        return envs.make(config.env.name, engine=config.env.engine, **options)
-    except envs.EnvError as error:
-        raise ConfigError(f"env: {error}") from None
-
-
 def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: Any, spec: Spec) -> Demonstrations:
     """What a teacher shows; raises `UserError` if that is not what it should be."""
     if teacher.source == "map":
+        goal_env.need(env, "a teacher by map", "arena")
         demos = teachers.shortest_paths(env)
     else:
         demos = teachers.load(Path(teacher.source), env=config.env.name, spec=spec, sha256=teacher.sha256)

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from star.agent.kind import STAR
+from star.agent.region_rows import flat
 from star.training.figures import draw_measures
 
 _MAX_PANELS = 5
@@ -83,7 +84,7 @@ def sgim_figure(*, regions: Sequence[Row], rows: Sequence[Row], walls: np.ndarra
 
 def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str = "chosen") -> None:
     """The first two abstract dimensions of the regions of a row, coloured `by` one of its values, over the walls."""
-    lower, upper, chosen = (np.asarray(row[key], float) for key in ("lower", "upper", by))
+    lower, upper, chosen = flat(row["lower"]), flat(row["upper"], height=1.0), np.asarray(row[by], float)
     colours = ScalarMappable(norm=Normalize(0, max(float(chosen.max()), 1e-9)), cmap="viridis").to_rgba(chosen)
     for low, high, colour in zip(lower, upper, colours, strict=True):
         width, height = (high - low)[:2]

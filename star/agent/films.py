@@ -18,15 +18,14 @@ from flax import struct
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from envs import video
+from envs import goal_env, video
 from envs.common import modes
 from envs.render import FINE_SHADOWS, SHADOWS, Marks, Painter, Stage, aspect_of
 from envs.topdown import Sheet, tiled
 from envs.vector import VectorEnv
 from star.abstraction.regions import Box
-from star.agent import exams
+from star.agent import environment, exams
 from star.agent.exams import Exam
-from star.agent.experiment import make_env
 from star.agent.play import greedy
 from star.agent.sections import Config
 from star.config.section import ConfigError
@@ -35,6 +34,7 @@ from star.training.checkpoint import agent_number, load_state
 
 MAX_ENVS = 25
 HEIGHTS = ((1, 480), (4, 320), (9, 240), (MAX_ENVS, 180))  # pixels of a tile, by the number of environments
+PICTURES = ("star render", "model", "pose", "arena")  # what needs what of an environment
 _TEST = Exam()
 WIDE = 16 / 9  # the shape that several tiles together come near to
 
@@ -127,7 +127,8 @@ def render(
 def record_random(config: Config, *, envs: int, steps: int | None, seed: int) -> Recording:
     """Actions drawn uniformly from all possible ones."""
     programs.select_device(config.trainer.device)
-    env = make_env(config, "train")
+    env = environment.make(config, "train")
+    goal_env.need(env, *PICTURES)
     vector = VectorEnv(env, envs, auto_reset=False)
     length = _length(env.episode_length, steps)
 
@@ -164,6 +165,7 @@ def record_run(
         raise ConfigError(f"--episode: {number} is not among 0 to {episodes - 1}; see --episodes")
     course = exams.prepare(config, exam, episodes=episodes, source=run_dir)
     program, env, spec = course.program, course.env, course.spec
+    goal_env.need(env, *PICTURES)
     length = _length(spec.episode_length, steps)
     index = agent_number(program, run_dir, agent)
     _, states = load_state(program, run_dir, checkpoint)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from envs.arena import ROBOT
-from star.agent.experiment import make_env
+from star.agent import environment
+from star.agent.region_rows import flat
 from star.agent.sections import Config
 from star.report.page import short
 
@@ -22,8 +23,9 @@ def growth_map(config: Config, rows: Sequence[Row], seeds: Sequence[int], *, mos
     room. `chosen`, `visited` and `drawn` are shares in %, other tables are as in `regions.jsonl`.
     """
     config = config.model_copy(update={"env": config.env.model_copy(update={"engine": "auto"})})
-    env = make_env(config, "test")
-    robots = env.arena.centres(ROBOT)
+    env = environment.make(config, "test")
+    arena = env.arena
+    robots = [] if arena is None else arena.centres(ROBOT).tolist()
     boxes: dict[tuple[float | None, ...], int] = {}
     frames: dict[int, list[dict[str, Any]]] = {seed: [] for seed in seeds}
     for row in _fewer(rows, most):
@@ -31,9 +33,9 @@ def growth_map(config: Config, rows: Sequence[Row], seeds: Sequence[int], *, mos
             frames[row["seed"]].append(_frame(row, boxes))
     return {
         "axes": ["xyz"[i] if i < 3 else f"state {i}" for i in env.abstract_indices],
-        "walls": np.round(env.arena.walls(), 3).tolist(),
-        "chasms": np.round(env.arena.chasms(), 3).tolist(),
-        "start": robots[0].tolist() if len(robots) == 1 else None,
+        "walls": np.round(env.walls, 3).tolist(),
+        "chasms": [] if arena is None else np.round(arena.chasms(), 3).tolist(),
+        "start": robots[0] if len(robots) == 1 else None,
         "boxes": list(boxes),
         "frames": [{"seed": seed, "moments": moments} for seed, moments in frames.items()],
     }
@@ -48,7 +50,8 @@ def _fewer(rows: Sequence[Row], most: int) -> list[Row]:
 
 
 def _frame(row: Row, boxes: dict[tuple[float | None, ...], int]) -> dict[str, Any]:
-    corners = (tuple(short([*low, *high])) for low, high in zip(row["lower"], row["upper"], strict=True))
+    lower, upper = flat(row["lower"]), flat(row["upper"], height=1.0)
+    corners = (tuple(short([*low, *high])) for low, high in zip(lower, upper, strict=True))
     kept = ("env_steps", "goal", "target", "reaches", "misses")
     frame = {key: row[key] for key in kept if key in row}
     frame["box"] = [boxes.setdefault(box, len(boxes)) for box in corners]

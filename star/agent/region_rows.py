@@ -75,3 +75,9 @@ def _table(config: AgentConfig, goal: Array, episode_length: int, state: TrainSt
         tables["competence"] = selection.competence(state.sgim)
         tables["drawn"] = selection.probabilities(config.sgim.selection, state.sgim).sum(axis=-1)
     return tables
+
+
+def flat(corners: Sequence[Sequence[float]], *, height: float = 0.0) -> np.ndarray:
+    """Corners [N, d] in two dimensions or more; where there is but one, the second is `height`."""
+    points = np.asarray(corners, float)
+    return points if points.shape[1] > 1 else np.insert(points, 1, height, axis=1)

@@ -137,7 +137,8 @@ def _run(arguments: list[str]) -> int:
         return 0
     if getattr(options, "experiment", None) is not None:
         overrides["experiment"] = options.experiment
-    for name in (*getattr(options, "modules", []), *filter(plugins.is_plugin, overrides.values())):
+    typed = (*overrides.values(), getattr(options, "task", None))
+    for name in (*getattr(options, "modules", []), *filter(plugins.is_plugin, typed)):
         plugins.trust(name.partition(":")[0])
     flags = {name: value(text) for name, text in vars(options).items() if "." in name and text is not None}
     return options.function(options, flags | overrides)

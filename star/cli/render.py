@@ -22,7 +22,7 @@ A setting of the task is given as --env.options.KEY VALUE."""
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Its arguments."""
-    parser.add_argument("task", nargs="?", help="one of `star envs`; with --run its own task")
+    parser.add_argument("task", nargs="?", help="one of `star envs`, or MODULE:NAME; with --run its own task")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=".png, .jpg, .mp4, .gif or .html")
     parser.add_argument("--run", type=Path, metavar="RUN", help="show the agent in this run directory")
     parser.add_argument("--checkpoint", metavar="last|best|STEPS", help="which one of the run (default: last)")

@@ -38,17 +38,23 @@ def command(*words: object) -> str:
     return shlex.join(["star", *map(str, words), *imports])
 
 
+def check_trust(name: str) -> None:
+    """Raise `UserError` in one line, if the module of `name` (`module:name`) must not be imported."""
+    module = name.partition(":")[0]
+    if module not in sys.modules and module not in _trusted():
+        raise ConfigError(
+            f"only a file names it, so it is not imported; type --import {module}, or set {TRUSTED}={module}"
+        )
+
+
 def find(name: str, kind: type[Kind]) -> Kind:
     """The value that `name` (`module:name`) stands for; modules may lie in the current folder.
 
     Raises:
       UserError: in one line, if the module is not trusted, cannot be imported, or holds no such `kind`.
     """
+    check_trust(name)
     module, _, attribute = name.partition(":")
-    if module not in sys.modules and module not in _trusted():
-        raise ConfigError(
-            f"only a file names it, so it is not imported; type --import {module}, or set {TRUSTED}={module}"
-        )
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)
@@ -56,11 +62,11 @@ def find(name: str, kind: type[Kind]) -> Kind:
         found = getattr(importlib.import_module(module), attribute, None)
     except Exception as error:  # whatever its author has done
         raise ConfigError(f"cannot be imported: {type(error).__name__}: {' '.join(str(error).split())}") from None
-    if not isinstance(found, kind):
-        allowed = f"allowed: a {kind.__module__}.{kind.__qualname__}"
+    if found is None or not isinstance(found, kind):
+        allowed = "" if kind is object else f"; allowed: a {kind.__module__}.{kind.__qualname__}"
         if found is None:
-            raise ConfigError(f"{module} holds no {attribute}; {allowed}")
-        raise ConfigError(f"is a {'class' if isinstance(found, type) else type(found).__name__}; {allowed}")
+            raise ConfigError(f"{module} holds no {attribute}{allowed}")
+        raise ConfigError(f"is a {'class' if isinstance(found, type) else type(found).__name__}{allowed}")
     return found
 
 

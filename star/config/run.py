@@ -10,7 +10,8 @@ from pydantic import Field, create_model, field_validator
 
 from envs.common import reading
 from envs.common.errors import shown
-from star.config.section import Positive, Section
+from star.config import plugins
+from star.config.section import ConfigError, Positive, Section
 
 
 def _is_simple(value: Any) -> bool:
@@ -23,10 +24,20 @@ def _is_simple(value: Any) -> bool:
 class EnvConfig(Section):
     """The task and the engine that simulates it."""
 
-    name: str = Field("point_maze", description="task, one of `star envs`")
+    name: str = Field("point_maze", description="task, one of `star envs`, or module:name of your own")
     engine: Literal["auto", "warp", "jax", "native"] = Field("auto", description="physics engine")
     options: dict[str, Any] = Field({}, description="options of the task, passed to envs.make")
     training: dict[str, Any] = Field({}, description="options that differ in training from those above")
+
+    @field_validator("name")
+    @classmethod
+    def _import_nothing_that_only_a_file_names(cls, value: str) -> str:
+        if plugins.is_plugin(value):
+            try:
+                plugins.check_trust(value)
+            except ConfigError as error:
+                raise ValueError(str(error)) from None
+        return value
 
     @field_validator("options", "training")
     @classmethod

@@ -9,9 +9,8 @@ import pytest
 
 from envs.point import PointState
 from star import cli
-from star.agent import demonstrations
+from star.agent import demonstrations, environment
 from star.agent.demonstrations import Moments
-from star.agent.experiment import make_env
 from star.config.loading import load
 from star.sgim import teachers
 from star.spec import Spec
@@ -26,7 +25,7 @@ def recorded(run, tmp_path_factory):
     out = tmp_path_factory.mktemp("recorded") / "demos.npz"
     config = load(run / "config.yaml")
     said = demonstrations.record(config, run, out, episodes=EPISODES, agent=6, seed=1, quiet=True)
-    env = make_env(config, "train")
+    env = environment.make(config, "train")
     return said, jax.tree.map(np.asarray, teachers.load(out, env="point_maze", spec=Spec.of(env))), env
 
 

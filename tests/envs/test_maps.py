@@ -89,7 +89,7 @@ def test_a_file_that_is_not_there_or_not_text_is_told(tmp_path):
 @given(st.text(alphabet="10rg#BD\n x", max_size=40).map(lambda text: text + "\n\n."))
 def test_any_text_is_a_map_or_refused_in_one_line(text):
     try:
-        arena = arenas.read(text, cell=4.0)
+        arena = arenas.read_arena(text, cell=4.0)
     except envs.EnvError as error:
         assert "\n" not in str(error)
     else:
@@ -99,8 +99,8 @@ def test_any_text_is_a_map_or_refused_in_one_line(text):
 def test_text_yaml_and_rows_give_the_same_arena(tmp_path):
     (tmp_path / "own.txt").write_text(OWN)
     (tmp_path / "own.yaml").write_text("cell: 4.0\nblock: xy\nmap: |" + OWN.replace("\n", "\n  "))
-    rows, text = arenas.read(OWN, cell=4.0), arenas.read(str(tmp_path / "own.txt"), cell=4.0)
-    assert rows == text == arenas.read(str(tmp_path / "own.yaml"), cell=8.0)
+    rows, text = arenas.read_arena(OWN, cell=4.0), arenas.read_arena(str(tmp_path / "own.txt"), cell=4.0)
+    assert rows == text == arenas.read_arena(str(tmp_path / "own.yaml"), cell=8.0)
 
 
 def test_on_a_map_of_ones_own_goals_success_and_regions_follow_the_map():

@@ -1,0 +1,145 @@
+"""Environments of a user's own, those of docs/your_robot.md: they train, resume, are imported on demand and draw."""
+
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from envs.common.errors import UserError
+from star.agent import environment
+from star.agent.figures import draw_regions
+from star.agent.growth_map import growth_map
+from star.cli import main
+from star.config import loading
+from star.spec import Spec
+from star.training.checkpoint import opened
+from tests.small import RUN
+
+PAGE = (Path(__file__).parents[2] / "docs" / "your_robot.md").read_text(encoding="utf-8")
+FILES = dict(re.findall(r'```\w+ title="([\w.]+)"\n(.*?)```', PAGE, re.DOTALL))
+MODULES = ("room", "arm", "car")
+ALONE = {"commander": {"enabled": False}, "tutor": {"enabled": False, "unroll": 5}}  # for the sake of compilation
+EPOCH = 100 * RUN["trainer"]["num_envs"]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty folder with the files of the page and a small run's config."""
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    settings = json.loads(json.dumps(RUN | ALONE | {"env": {"name": "room:make"}}))
+    settings["trainer"]["total_env_steps"] = 4 * EPOCH
+    (tmp_path / "run.yaml").write_text(json.dumps(settings))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setenv("STAR_IMPORT", "")
+    forget(monkeypatch)
+    yield tmp_path
+    forget(monkeypatch)
+
+
+def forget(monkeypatch):
+    """As in a new process: nothing is trusted and nothing imported."""
+    monkeypatch.setenv("STAR_IMPORT", "")
+    for module in MODULES:
+        sys.modules.pop(module, None)
+
+
+def arrays(run, env_steps):
+    with opened(run) as checkpoints:
+        return checkpoints.arrays(env_steps)
+
+
+def test_it_trains_and_resumes_bit_for_bit_where_it_is_trusted(here, monkeypatch, capsys):
+    train = ["train", "run.yaml", "--import", "room", "--trainer.checkpoint_every", "1", "--quiet"]
+    assert main([*train, "--run-dir", "whole"]) == 0
+    assert main([*train, "--run-dir", "parts", "--total-env-steps", str(2 * EPOCH)]) == 0
+    forget(monkeypatch)
+    for command in (
+        ["train", "run.yaml", "--run-dir", "new"],
+        ["train", "--resume", "parts"],
+        ["evaluate", "parts"],
+        ["render", "--run", "parts", "--out", "new.png"],
+        ["record", "parts", "--out", "new.npz"],
+        ["report", "parts", "--out", "new.html"],
+    ):
+        capsys.readouterr()
+        assert main(command) == 2
+        assert "only a file names it, so it is not imported; type --import room" in capsys.readouterr().err
+    assert "room" not in sys.modules and not list(here.glob("new*"))
+    assert main(["train", "--resume", "parts", "--total-env-steps", str(4 * EPOCH), "--import", "room", "--quiet"]) == 0
+    whole, parts = arrays(here / "whole", 4 * EPOCH), arrays(here / "parts", 4 * EPOCH)
+    assert whole.keys() == parts.keys()
+    for name, array in whole.items():
+        np.testing.assert_array_equal(array, parts[name], err_msg=name)
+    assert main(["evaluate", "whole", "--import", "room", "--json", "--quiet"]) == 0
+    row = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (row["env"], row["engine"], row["spl"]) == ("room:make", "auto", None)
+    assert main(["report", "whole", "--import", "room", "--out", "report.html"]) == 0
+    assert main(["render", "--run", "whole", "--import", "room", "--out", "new.png"]) == 2
+    assert "room:make has no model, which star render needs" in capsys.readouterr().err
+
+
+def config(name, **options):
+    return loading.parse({"env": {"name": name, "options": options}})
+
+
+@pytest.fixture
+def trusted(here, monkeypatch):
+    monkeypatch.setenv("STAR_IMPORT", ",".join(MODULES))
+    return here
+
+
+def test_a_robot_from_an_xml_stands_in_a_room_from_a_map(trusted):
+    made = environment.make(config("car:make", episode_length=100), "test")
+    spec = Spec.of(made)
+    assert (spec.action_size, spec.episode_length, spec.orientation, made.engine) == (2, 100, (3, 4, 5, 6), "native")
+    assert spec.state_dim == made.body.physics.model.nq + made.body.physics.model.nv
+    assert made.dt == pytest.approx(0.1)
+    assert environment.engine_of(config("car:make"), made) == "native"
+    with pytest.raises(UserError, match=r'env: engine is "jax", but room:make takes no engine; allowed: auto'):
+        environment.make(loading.parse({"env": {"name": "room:make", "engine": "jax"}}), "train")
+
+
+def test_a_robot_is_drawn(trusted, can_draw):
+    assert main(["render", "car:make", "--steps", "1", "--height", "120", "--out", "car.png", "--quiet"]) == 0
+    assert (trusted / "car.png").stat().st_size > 2000
+
+
+def test_what_cannot_be_had_is_said_in_one_line(trusted):
+    (trusted / "bad.py").write_text("def make(goals):\n    raise KeyError('no robot')\n\nnumber = 3\n")
+    for name, options, line in (
+        ("room:make", {"size": 3}, 'env: option "size" is not one of room:make; allowed: goals'),
+        ("room:house", {}, "env: room:house: room holds no house"),
+        ("bad:number", {}, "env: bad:number: is a int; allowed: a function that makes an environment"),
+        ("bad:make", {}, "env: bad:make: raises KeyError: 'no robot' (" + str(trusted / "bad.py") + ", line 2)"),
+    ):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("STAR_IMPORT", "room,bad")
+            with pytest.raises(UserError) as error:
+                environment.make(config(name, **options), "train")
+        assert str(error.value).startswith(line)
+    sys.modules.pop("bad", None)
+
+
+def test_features_that_need_more_say_so_before_anything_begins(trusted, capsys):
+    for setting, line in (
+        (["--sgim.goals", "true"], "room:make has no with_goal, which SGIM needs"),
+        (["--controller.frame", "body"], "the body has no orientation"),
+    ):
+        assert main(["train", "run.yaml", *setting, "--run-dir", "new", "--quiet"]) == 2
+        assert line in capsys.readouterr().err and not (trusted / "new").exists()
+
+
+def test_regions_along_one_dimension_are_drawn_too(trusted):
+    row = {"lower": [[0.0], [4.0]], "upper": [[4.0], [9.0]], "chosen": [1.0, 2.0], "env_steps": 10, "seed": 0}
+    axis = Figure().subplots()
+    draw_regions(axis, row, np.zeros((0, 4)))
+    assert [patch.get_bbox().bounds for patch in axis.patches] == [(0, 0, 4, 1), (4, 0, 5, 1)]
+    drawn = growth_map(config("room:make"), [row], [0], most=10)
+    assert drawn["boxes"] == [(0, 0, 4, 1), (4, 0, 9, 1)]
+    assert (drawn["walls"], drawn["chasms"], drawn["start"]) == ([], [], None)
