@@ -188,5 +188,8 @@ def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: An
 
 def _a_goal(spec: Spec, env: Any) -> np.ndarray:
     """A goal that `env` draws, as an abstract point [d]; dimensions that goals leave open are 0."""
-    goal = env.draw_goal(modes.key(0))
-    return np.asarray(spec.goal_point(jax.numpy.concatenate([jax.numpy.zeros(spec.state_dim), goal])))
+
+    def drawn(key: jax.Array) -> jax.Array:
+        return spec.goal_point(jax.numpy.concatenate([jax.numpy.zeros(spec.state_dim), env.draw_goal(key)]))
+
+    return np.asarray(jax.jit(drawn)(modes.key(0)))  # operation by operation it would compile twenty programs
