@@ -133,12 +133,7 @@ def nested(values: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
 
 
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20)
-CODE = [
-    "subprocess:check_output",
-    "json:loads",
-    "nobody:make",
-    "configs:maze",
-]  # names of code, as a stranger may write them
+CODE = ["subprocess:check_output", "json:loads", "nobody:make"]  # as a stranger may name it
 HOSTILE = st.sampled_from(ODD) | st.sampled_from(ODD + CODE) | SCALARS | nested(SCALARS)
 WORDS = st.text(max_size=12) | st.sampled_from(
     ["x", "trainer", "perod", "", "\N{LIZARD}", "\x1b[31m", "a\nb", "env.name", "x" * 3000, "__class__", "model_config"]

@@ -32,7 +32,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from envs.common.batching import where
-from star.abstraction import forward_model, passages, reachability, regions
+from star.abstraction import cutting, forward_model, passages, reachability, regions
 from star.abstraction.forward_model import ForwardModelState, Outcome
 from star.abstraction.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves
 from star.abstraction.regions import Abstraction, Change, Cut, Split
@@ -171,57 +171,6 @@ def due(config: Settings, graph: Graph, active: Bool[Array, "R"]) -> Bool[Array,
     return pairs & commanded & graph.stable & (graph.verdict == UNKNOWN)
 
 
-def best_cut(
-    abstraction: Abstraction,
-    candidates: Bool[Array, "R"],
-    leaves: Leaves,
-    *,
-    min_width: float | Array,
-) -> tuple[Cut, Float[Array, ""]]:
-    """The cut of one of the `candidates` that best parts reaching from missing leaves, and what it gains.
-
-    The gain is the decrease of Gini impurity, as in a decision tree: the impurity of a part with volume v, of which r
-    reaches, is r (v - r) / v; it is given as a share of the volume of all leaves. Cuts lie on leaf boundaries and
-    leave both parts at least `min_width` wide.
-    """
-    positions = leaves.upper.T  # those of places not in use lie on the faces of the box, where nothing can be cut
-    volume = jnp.prod(leaves.upper - leaves.lower, axis=-1)
-
-    def overlap(lower: Array, upper: Array) -> Float[Array, "L"]:
-        inside = jnp.minimum(upper, leaves.upper) - jnp.maximum(lower, leaves.lower)
-        return jnp.prod(jnp.maximum(inside, 0.0), axis=-1)
-
-    def impurity(part: Float[Array, "L"]) -> Array:
-        reaching, missing = jnp.sum(part * leaves.reaches), jnp.sum(part * ~leaves.reaches)
-        return reaching * missing / jnp.maximum(reaching + missing, 1e-12)
-
-    def gain(region: Array, dimension: Array, position: Array) -> Array:
-        lower, upper = abstraction.lower[region], abstraction.upper[region]
-        wide = (position - lower[dimension] >= min_width) & (upper[dimension] - position >= min_width)
-        below = overlap(lower, upper.at[dimension].set(jnp.minimum(position, upper[dimension])))
-        whole = overlap(lower, upper)
-        decrease = impurity(whole) - impurity(below) - impurity(whole - below)
-        return jnp.where(wide & candidates[region], decrease / volume.sum(), 0.0)
-
-    d, count = positions.shape
-    every_region, every_dimension = jnp.arange(abstraction.capacity), jnp.arange(d)
-    over_positions = jax.vmap(gain, in_axes=(None, None, 0))
-    over_dimensions = jax.vmap(over_positions, in_axes=(None, 0, 0))
-    gains = jax.vmap(over_dimensions, in_axes=(0, None, None))(every_region, every_dimension, positions)
-    best = jnp.argmax(gains)
-    region, dimension, index = jnp.unravel_index(best, (abstraction.capacity, d, count))
-    return Cut(region=region, dimension=dimension, position=positions[dimension, index]), gains.reshape(-1)[best]
-
-
-def random_cut(abstraction: Abstraction, region: Int[Array, ""], *, min_width: float | Array, key: Array) -> Cut:
-    """A cut of `region` anywhere along any dimension that leaves both parts at least `min_width` wide."""
-    dimension_key, position_key = jax.random.split(key)
-    lowest, highest = abstraction.lower[region] + min_width, abstraction.upper[region] - min_width
-    dimension = jax.random.categorical(dimension_key, jnp.where(lowest <= highest, 0.0, -jnp.inf))
-    position = jax.random.uniform(position_key, minval=lowest[dimension], maxval=highest[dimension])
-    return Cut(region=region, dimension=dimension, position=position)
-
-
 def refine(
     config: Settings,
     abstraction: Abstraction,
@@ -239,8 +188,7 @@ def refine(
     the urgency of those that lead to each region. Returns the graph of the new regions, and the change that tables
     indexed by region have to follow, with [pairs_per_epoch * cuts_per_pair] splits and those where nobody passes.
     """
-    graph, before = forget(config, graph), abstraction
-    periods = forward_model.remembered(model)
+    graph, before, periods = forget(config, graph), abstraction, forward_model.remembered(model)
 
     def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
         abstraction, graph = carry
@@ -258,9 +206,8 @@ def refine(
             ),
         )
         mixed = judged & (verdict == MIXED)
-        cuttable = mixed
-        if config.refinement.neighbours:
-            cuttable &= inside | regions.adjacent(abstraction)[region, target]
+        near = inside | regions.adjacent(abstraction)[region, target]
+        cuttable = mixed & near if config.refinement.neighbours else mixed
         abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, cuttable, key=cut_key)
         verdict = jnp.where(mixed & ~splits.done.any() & reachability.reaches_where_visited(leaves), REACHES, verdict)
         recorded = (verdict == REACHES) | ((verdict == MISSES) & (config.refinement.miss_lifetime > 0))
@@ -272,16 +219,13 @@ def refine(
     (abstraction, graph), (splits, found, mixed) = jax.lax.scan(
         one_pair, (abstraction, graph), jax.random.split(key, config.refinement.pairs_per_epoch)
     )
-    splits = jax.tree.map(lambda x: x.reshape(-1), splits)
-    separated = jnp.zeros((), jnp.int32)
-    if config.refinement.separate:
-        abstraction, graph, more = _separate(config, abstraction, graph, periods)
-        splits, separated = jax.tree.map(lambda *both: jnp.concatenate(both), splits, more), more.done.sum()
+    abstraction, graph, more = _separate(config, abstraction, graph, periods)
+    splits = jax.tree.map(lambda x, other: jnp.concatenate([x.reshape(-1), other]), splits, more)
     metrics = {
         "examined": found.sum(),
         "mixed": mixed.sum(),
         "splits": splits.done.sum(),
-        "separated": separated,
+        "separated": more.done.sum(),
         "edges": graph.reaches.sum(),
         "misses": graph.misses.sum(),
         "table_full": (abstraction.count == abstraction.capacity).astype(jnp.int32),
@@ -292,10 +236,10 @@ def refine(
 def _separate(
     config: Settings, abstraction: Abstraction, graph: Graph, periods: Outcome
 ) -> tuple[Abstraction, Graph, Split]:
-    """Cut regions where nobody passes, those first in which most move on either side."""
+    """Cut regions where nobody passes, if that is wanted, those first in which most move on either side."""
     min_width = config.abstraction.min_width
     cuts, evidence = passages.cuts(abstraction, periods, min_width=min_width)
-    worst = jnp.argsort(-evidence)[:_SEPARATED]
+    worst = jnp.argsort(-evidence)[: _SEPARATED * config.refinement.separate]
 
     def one(carry: tuple[Abstraction, Graph], chosen: tuple[Cut, Array]) -> tuple[tuple[Abstraction, Graph], Split]:
         abstraction, graph = carry
@@ -409,9 +353,9 @@ def _cut(
         abstraction, graph, parts = carry
         min_width = config.abstraction.min_width
         candidates = parts & regions.coarse(abstraction, config.abstraction.min_share)
-        cut, gain = best_cut(abstraction, candidates, leaves, min_width=min_width)
+        cut, gain = cutting.best_cut(abstraction, candidates, leaves, min_width=min_width)
         if config.refinement.cuts == "random":
-            cut = random_cut(abstraction, cut.region, min_width=min_width, key=cut_key)
+            cut = cutting.random_cut(abstraction, cut.region, min_width=min_width, key=cut_key)
         child = abstraction.count
         after, possible = regions.split(abstraction, cut, min_width=min_width)
         split = Split(done=mixed & possible & (gain > 1e-6), cut=cut, child=jnp.minimum(child, parts.shape[0] - 1))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star.abstraction import forward_model, refinement, regions
+from star.abstraction import cutting, forward_model, refinement, regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.reachability import MISSES, REACHES, UNKNOWN, Leaves
 from star.abstraction.refinement import Goals, Graph
@@ -182,7 +182,7 @@ def slow_gain(lower, upper, leaves, dimension, position):
 
 @pytest.fixture(scope="module")
 def best_cut():
-    return jax.jit(lambda a, c, leaves, width: refinement.best_cut(a, c, leaves, min_width=width))
+    return jax.jit(lambda a, c, leaves, width: cutting.best_cut(a, c, leaves, min_width=width))
 
 
 @pytest.mark.parametrize("seed", range(5))
