@@ -45,7 +45,7 @@ STAR = Kind(
     format=FORMAT,
     migrations=TO_NEXT,
     harmless=("env.engine",),
-    older={"tutor.straight": False, "commander.trust": 1.0},
+    older={"tutor.straight": False, "commander.trust": 1.0, "refinement.separate": False},
     anywhere={"env.engine": "auto"},
     commands={
         "evaluate": _lazily("commands", "evaluate"),

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, MaxNLocator
 
 Row = Mapping[str, Any]
 
@@ -55,6 +56,8 @@ def draw_measures(axis: Axes, rows: Sequence[Row], measures: Sequence[Measure], 
         low, high = [np.min(c) for c in curves], [np.max(c) for c in curves]
         own.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
     axis.set_xlabel(unit)
+    axis.xaxis.set_major_locator(MaxNLocator(5))
+    axis.xaxis.set_major_formatter(EngFormatter(sep=""))  # 50k, 1.5M
     axis.set_ylabel(f"evaluation {measures[0].where}".rstrip())
     if shares:
         axis.set_ylim(-0.02, 1.02)
