@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, MaxNLocator
 
 Row = Mapping[str, Any]
 
@@ -38,6 +37,8 @@ def draw_measures(axis: Axes, rows: Sequence[Row], measures: Sequence[Measure], 
 
     Beside shares of episodes others have an axis of their own, on the right.
     """
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
     shares = [measure for measure in measures if measure.episodes]
     others = [one for one in measures if not one.episodes and any(row.get(one.key) is not None for row in rows)]
     beside = axis.twinx() if shares and others else axis
