@@ -29,7 +29,7 @@ from envs._quiet import Env, State
 from envs.common import modes
 from envs.common.batching import where
 from envs.common.errors import shown
-from envs.maze import MazeEnv
+from envs.maze import MazeEnv, all_finite
 from envs.options import EnvError
 
 Corner = Sequence[float]
@@ -142,7 +142,7 @@ class Adapted(Env):
         before = state.pipeline_state
         after = self._env.step(before.data, jnp.clip(action, -1.0, 1.0))
         steps = before.steps + 1
-        going, finite = before.ended == 0, _all_finite(after)
+        going, finite = before.ended == 0, all_finite(after)
         cut = jnp.asarray(after.info.get("truncation", 0.0), jnp.float32) > 0
         over = going & finite & (_scalar(after.done) > 0) & (steps < self.episode_length)
         terminated = (before.terminated > 0) | (over & ~cut)
@@ -214,11 +214,6 @@ def _told(wrapped: Wrapped, info: dict[str, Any], *, done: jax.Array, non_finite
 
 def _scalar(value: Any) -> jax.Array:
     return jnp.asarray(value).astype(jnp.float32)
-
-
-def _all_finite(tree: Any) -> jax.Array:
-    numbers = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in numbers]).all()
 
 
 def _indices(values: Any) -> tuple[int, ...]:

@@ -267,7 +267,7 @@ class MazeEnv(Env):
         data, noise = self._shaken(self._body.step(before.data, jnp.clip(action, -1.0, 1.0)), before.noise)
         steps = before.steps + 1
         seen = self._body.observe(data, steps)
-        non_finite = ~(_all_finite(data) & jnp.isfinite(seen).all())
+        non_finite = ~(all_finite(data) & jnp.isfinite(seen).all())
         overflow = ~non_finite & self._body.dropped(data)
         mishaps = {name: ~non_finite & getattr(self._body, name)(data) for name in self._ends}
         going, failed = before.ended == 0, non_finite | overflow
@@ -339,5 +339,7 @@ def _distance(achieved: Any, desired: Any) -> Any:
     return ((achieved - desired) ** 2).sum(axis=-1) ** 0.5
 
 
-def _all_finite(data: Any) -> jax.Array:
-    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(data)]).all()
+def all_finite(data: Any) -> jax.Array:
+    """Whether no floating point number in a pytree is NaN or infinite (bool)."""
+    numbers = [leaf for leaf in jax.tree.leaves(data) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in numbers]).all()

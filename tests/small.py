@@ -3,6 +3,8 @@
 import shutil
 from pathlib import Path
 
+from star.training.checkpoint import opened
+
 EPOCH = 4 * 60  # env steps
 
 RUN = {
@@ -15,6 +17,12 @@ RUN = {
     "refinement": {"min_transitions": 1, "min_visits": 1, "depth": 1, "pairs_per_epoch": 1},
     "trainer": {"num_envs": 4, "total_env_steps": 4 * EPOCH, "eval_every": 2, "eval_episodes": 3},
 }
+
+
+def arrays(run, env_steps):
+    """Those of a checkpoint, by their names."""
+    with opened(Path(run)) as checkpoints:
+        return checkpoints.arrays(env_steps)
 
 
 def unpacked(name, folder):

@@ -71,10 +71,9 @@ def folder(tmp_path, monkeypatch):
     """A working directory with the shipped config files and those of the tutorial, where no command really trains."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
-    for name, text in (files("docs/tutorial.md") | files("docs/howto.md")).items():
-        (tmp_path / name).write_text(text)
-    for name, text in (files("docs/experiments.md") | files("docs/your_robot.md")).items():
-        (tmp_path / name).write_text(text)
+    for page in ("tutorial", "howto", "experiments", "your_robot"):
+        for name, text in files(f"docs/{page}.md").items():
+            (tmp_path / name).write_text(text)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setenv("STAR_IMPORT", "")
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
@@ -46,10 +46,13 @@ def cuts(
         share = (point - corner[region]) / sides[region]
         return jnp.clip(jnp.floor(PLANES * share), 0, PLANES - 1).astype(jnp.int32)
 
+    def count(parts: Array, weight: Float[Array, "N"]) -> Float[Array, "R d parts"]:
+        """How many are in each part."""
+        return jnp.zeros((*sides.shape, PLANES)).at[region[:, None], dimension, parts].add(weight[:, None])
+
     def below(parts: Array, weight: Float[Array, "N"]) -> Float[Array, "R d planes"]:
         """How many are in parts below each plane."""
-        empty = jnp.zeros((*sides.shape, PLANES))
-        return jnp.cumsum(empty.at[region[:, None], dimension, parts].add(weight[:, None]), axis=-1)[..., :-1]
+        return jnp.cumsum(count(parts, weight), axis=-1)[..., :-1]
 
     began, ended = part(periods.start), part(periods.end)
     led = jnp.zeros((*sides.shape, PLANES, len(sides)))
@@ -76,20 +79,21 @@ def cuts(
     inside = jnp.arange(1, PLANES) / PLANES * sides[..., None]
     wide = (inside >= min_width) & (sides[..., None] - inside >= min_width)
     sound = wide & (fewer >= LEAST) & (overlap <= OVERLAP) & abstraction.active[:, None, None]
-    score = jnp.where(sound, fewer + _room(began, ended, region, periods.weight, stays, sides.shape) / PLANES, 0.0)
-    best = jnp.argmax(score.reshape(len(sides), -1), axis=1)
-    along, plane = jnp.unravel_index(best, sound.shape[1:])
-    each = jnp.arange(len(sides))
-    position = corner[each, along] + inside[each, along, plane]
-    return Cut(region=each, dimension=along, position=position), jnp.floor(score.max(axis=(1, 2)))
+    entered = count(began, periods.weight) + count(ended, periods.weight * stays) > 0
+    score = jnp.where(sound, fewer + _room(entered) / PLANES, 0.0)
+    return _best(score, corner[..., None] + inside), jnp.floor(score.max(axis=(1, 2)))
 
 
-def _room(began: Array, ended: Array, region: Array, weight: Array, stays: Array, shape: tuple) -> Array:
-    """How many parts on the nearer side of each plane [R, d, planes] nobody was in, below PLANES / 2."""
-    place = (region[:, None], jnp.arange(shape[1]))
-    seen = jnp.zeros((*shape, PLANES)).at[*place, began].add(weight[:, None])
-    seen = seen.at[*place, ended].add((weight * stays)[:, None]) > 0
+def _best(score: Float[Array, "R d planes"], position: Float[Array, "R d planes"]) -> Cut:
+    """The plane of each region that has the largest score."""
+    each = jnp.arange(len(score))
+    along, plane = jnp.unravel_index(jnp.argmax(score.reshape(len(score), -1), axis=1), score.shape[1:])
+    return Cut(region=each, dimension=along, position=position[each, along, plane])
+
+
+def _room(entered: Bool[Array, "R d parts"]) -> Int[Array, "R d planes"]:
+    """How many parts on the nearer side of each plane nobody has `entered`, below PLANES / 2."""
     index = jnp.arange(PLANES)
-    under = jax.lax.cummax(jnp.where(seen, index, -1), axis=2)[..., :-1]
-    over = jax.lax.cummin(jnp.where(seen, index, PLANES), axis=2, reverse=True)[..., 1:]
+    under = jax.lax.cummax(jnp.where(entered, index, -1), axis=2)[..., :-1]
+    over = jax.lax.cummin(jnp.where(entered, index, PLANES), axis=2, reverse=True)[..., 1:]
     return jnp.minimum(index[:-1] - under, over - index[1:])

@@ -237,17 +237,13 @@ def _separate(
     config: Settings, abstraction: Abstraction, graph: Graph, periods: Outcome
 ) -> tuple[Abstraction, Graph, Split]:
     """Cut regions where nobody passes, if that is wanted, those first in which most move on either side."""
-    min_width = config.abstraction.min_width
-    cuts, evidence = passages.cuts(abstraction, periods, min_width=min_width)
+    cuts, evidence = passages.cuts(abstraction, periods, min_width=config.abstraction.min_width)
     worst = jnp.argsort(-evidence)[: _SEPARATED * config.refinement.separate]
 
     def one(carry: tuple[Abstraction, Graph], chosen: tuple[Cut, Array]) -> tuple[tuple[Abstraction, Graph], Split]:
-        abstraction, graph = carry
         cut, evidence = chosen
-        after, possible = regions.split(abstraction, cut, min_width=min_width)
-        child = jnp.minimum(abstraction.count, abstraction.capacity - 1)
-        split = Split(done=possible & (evidence > 0), cut=cut, child=child)
-        return (where(split.done, after, abstraction), on_split(graph, split)), split
+        abstraction, graph, split = _split(config, *carry, cut, wanted=evidence > 0)
+        return (abstraction, graph), split
 
     chosen = jax.tree.map(lambda x: x[worst], (cuts, evidence))
     (abstraction, graph), splits = jax.lax.scan(one, (abstraction, graph), chosen)
@@ -262,6 +258,16 @@ def _most_urgent(
     urgency = graph.transitions * (1 + graph.age) * weight
     region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, urgency, -1.0)), waiting.shape)
     return region, target, waiting[region, target]
+
+
+def _split(
+    config: Settings, abstraction: Abstraction, graph: Graph, cut: Cut, *, wanted: Bool[Array, ""]
+) -> tuple[Abstraction, Graph, Split]:
+    """Make a cut if it is `wanted` and possible, and let the graph follow."""
+    after, possible = regions.split(abstraction, cut, min_width=config.abstraction.min_width)
+    child = jnp.minimum(abstraction.count, abstraction.capacity - 1)
+    split = Split(done=wanted & possible, cut=cut, child=child)
+    return where(split.done, after, abstraction), on_split(graph, split), split
 
 
 def on_split(graph: Graph, split: Split) -> Graph:
@@ -356,12 +362,9 @@ def _cut(
         cut, gain = cutting.best_cut(abstraction, candidates, leaves, min_width=min_width)
         if config.refinement.cuts == "random":
             cut = cutting.random_cut(abstraction, cut.region, min_width=min_width, key=cut_key)
-        child = abstraction.count
-        after, possible = regions.split(abstraction, cut, min_width=min_width)
-        split = Split(done=mixed & possible & (gain > 1e-6), cut=cut, child=jnp.minimum(child, parts.shape[0] - 1))
-        abstraction = where(split.done, after, abstraction)
+        abstraction, graph, split = _split(config, abstraction, graph, cut, wanted=mixed & (gain > 1e-6))
         parts = parts.at[split.child].set(parts[split.child] | split.done)
-        return (abstraction, on_split(graph, split), parts), split
+        return (abstraction, graph, parts), split
 
     parts = jnp.zeros(abstraction.capacity, bool).at[region].set(True)
     (abstraction, graph, _), splits = jax.lax.scan(

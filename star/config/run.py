@@ -11,7 +11,7 @@ from pydantic import Field, create_model, field_validator
 from envs.common import reading
 from envs.common.errors import shown
 from star.config import plugins
-from star.config.section import ConfigError, Positive, Section
+from star.config.section import Positive, Section
 
 
 def _is_simple(value: Any) -> bool:
@@ -33,10 +33,7 @@ class EnvConfig(Section):
     @classmethod
     def _import_nothing_that_only_a_file_names(cls, value: str) -> str:
         if plugins.is_plugin(value):
-            try:
-                plugins.check_trust(value)
-            except ConfigError as error:
-                raise ValueError(str(error)) from None
+            plugins.check_trust(value)
         return value
 
     @field_validator("options", "training")

@@ -16,8 +16,7 @@ from star.agent.growth_map import growth_map
 from star.cli import main
 from star.config import loading
 from star.spec import Spec
-from star.training.checkpoint import opened
-from tests.small import RUN
+from tests.small import RUN, arrays
 
 PAGE = (Path(__file__).parents[2] / "docs" / "your_robot.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r'```\w+ title="([\w.]+)"\n(.*?)```', PAGE, re.DOTALL))
@@ -47,11 +46,6 @@ def forget(monkeypatch):
     monkeypatch.setenv("STAR_IMPORT", "")
     for module in MODULES:
         sys.modules.pop(module, None)
-
-
-def arrays(run, env_steps):
-    with opened(run) as checkpoints:
-        return checkpoints.arrays(env_steps)
 
 
 def test_it_trains_and_resumes_bit_for_bit_where_it_is_trusted(here, monkeypatch, capsys):

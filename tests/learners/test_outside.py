@@ -12,8 +12,7 @@ import pytest
 from envs.common.errors import UserError
 from star.cli import main
 from star.config import loading
-from star.training.checkpoint import opened
-from tests.small import EPOCH, RUN
+from tests.small import EPOCH, RUN, arrays
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto.md"
 LEARNER = ["--controller.learner", "mine:reinforce"]
@@ -39,11 +38,6 @@ def forget(monkeypatch):
     """As in a new process: nothing is trusted and nothing imported."""
     monkeypatch.setenv("STAR_IMPORT", "")
     sys.modules.pop("mine", None)
-
-
-def arrays(run, env_steps):
-    with opened(run) as checkpoints:
-        return checkpoints.arrays(env_steps)
 
 
 def test_it_trains_checkpoints_and_resumes_bit_for_bit(here, monkeypatch, capsys):

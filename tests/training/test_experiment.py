@@ -17,8 +17,9 @@ from star.config import kinds
 from star.config.kinds import Measure
 from star.config.loading import parse
 from star.sweeps import work as working
-from star.training.checkpoint import Checkpoints, opened
+from star.training.checkpoint import Checkpoints
 from star.training.journal import JsonLines
+from tests.small import arrays
 
 PAGE = Path(__file__).parents[2] / "docs" / "experiments.md"
 # The same with a measure where less is better, and seeds that share a counter.
@@ -64,11 +65,6 @@ def here(tmp_path, monkeypatch):
 def trained(run, *words, config="run.yaml"):
     assert main(["train", config, "--run-dir", run, "--quiet", *words]) == 0
     return Path(run)
-
-
-def arrays(run, step):
-    with opened(Path(run)) as checkpoints:
-        return checkpoints.arrays(step)
 
 
 def test_what_there_is_to_note_is_said_once_of_each_seed_unless_quiet_is_wanted(here, capsys):
