@@ -57,12 +57,11 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
     fresh = jax.tree.map(
         lambda x: x[:, 0, : min(x.shape[2], program.config.trainer.num_envs * 16)], state.forward_model.ring.experience
     )
-    goals = refinement.Goals.of(fresh, jnp.ones_like(fresh.weight, bool), cube=program.experiment.spec.cube)
     keys = jax.random.split(jax.random.key(0), len(program.seeds))
 
     @jax.jit
     @jax.vmap
-    def refine(state: TrainState, goals: refinement.Goals, key: jax.Array) -> Any:
+    def refine(state: TrainState, goals: models.Outcome, key: jax.Array) -> Any:
         tables = state.abstraction, state.graph, state.forward_model
         return refinement.refine(agent, *tables, goals, cube=program.experiment.spec.cube, key=key)
 
@@ -78,7 +77,7 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
         "first_epoch_s": compile_s,
         "env_steps_per_s": steps / epoch_s,
         "physics_env_steps_per_s": _physics_speed(program, len(program.seeds)),
-        "refinement_share": _seconds(refine, state, goals, keys) / epoch_s,
+        "refinement_share": _seconds(refine, state, fresh, keys) / epoch_s,
         "forward_model_share": _seconds(train, state.forward_model, fresh, keys) / epoch_s,
     }
 

@@ -1,13 +1,22 @@
-"""Where a region falls apart: a plane through it from whose two sides agents get to different places.
+"""Where a region falls apart: a plane through it that agents do not pass.
 
 A wall through a region makes two places of it that look like one. Plans then go in at the one and come out at the
-other. Of the remembered periods in which agents moved, those that began in the region say where each side leads: into
-other regions, or to either side of the plane. With shares P of the places where periods end,
+other. It shows in two ways.
+
+Its sides lead to different places. Of the remembered periods in which agents moved, those that began in the region say
+where each side leads: into other regions, or to either side of the plane. With shares P of the places where periods
+end,
 
     overlap = sum over places of min(P(place | began below), P(place | began above))
 
-The plane is a cut where that is next to nothing and enough periods began on either side. Of several it is the one whose
-emptier side has most, and of these the one that is farthest from where agents were: in the middle of the wall.
+is next to nothing, and enough periods began on either side.
+
+Goals beyond it are not reached. Of the periods in which agents were sent to a goal in their own region, next to none
+whose goal was on the other side of the plane ended there, while most goals on the agents' own side were reached. Nobody
+has to have been beyond.
+
+Of several planes the one with most evidence is a cut, and of these the one that is farthest from where agents were and
+goals are: in the middle of the wall.
 """
 
 from __future__ import annotations
@@ -23,48 +32,57 @@ from star.abstraction.regions import Abstraction, Cut
 PLANES = 32  # equal parts of a region along each dimension; planes lie between them
 OVERLAP = 0.2  # the most that the two sides of a wall have in common: some agents find a way around it in one period
 LEAST = 5  # periods on either side: the far side of a wall is rarely visited
+TRIES = 10  # periods towards goals on the other side
+PASSED = 0.1  # the most of them that end there: regions are large, and a period may end before a plane that is far
+ABLE = 0.5  # the least of the goals on their own side that agents reach: who cannot walk yet reaches none
+
+Parts = Int[Array, "N d"]
+Planes = Float[Array, "R d planes"]
 
 
 def cuts(
     abstraction: Abstraction,
     periods: Outcome,
+    goals: Outcome,
+    reached: Bool[Array, "M"],
     *,
     min_width: float | Array,
 ) -> tuple[Cut, Float[Array, "R"]]:
-    """The cut of each region [R], and the periods that began on its emptier side; 0 where there is none.
+    """The cut of each region [R], and the periods that speak for it; 0 where there is none.
 
-    `periods` [N] are remembered ones; who has not moved by `min_width` along any dimension tells nothing. At least
-    `LEAST` begin on either side, which is `min_width` wide or more.
+    `periods` [N] are remembered ones; who has not moved by `min_width` along any dimension tells nothing. `goals` [M]
+    are those of an epoch in which agents were given a goal, and whether it was `reached`. Both sides of a cut are
+    `min_width` wide or more.
     """
+    corner, sides = abstraction.lower, abstraction.upper - abstraction.lower
+    inside = jnp.arange(1, PLANES) / PLANES * sides[..., None]
+    wide = (inside >= min_width) & (sides[..., None] - inside >= min_width) & abstraction.active[:, None, None]
+    evidence = jnp.maximum(
+        _leading_apart(abstraction, periods, min_width=min_width), _not_passed(abstraction, goals, reached)
+    )
+    room = _room(_free(abstraction, periods, goals))
+    score = jnp.where(wide & (evidence > 0), evidence + room / PLANES, 0.0)
+    return _best(score, corner[..., None] + inside), jnp.floor(score.max(axis=(1, 2)))
+
+
+def _leading_apart(abstraction: Abstraction, periods: Outcome, *, min_width: float | Array) -> Planes:
+    """The periods on the emptier side of each plane whose sides lead to different places; 0 at all others."""
     region, there = (regions.locate(abstraction, point) for point in (periods.start, periods.end))
     moved = jnp.abs(periods.end - periods.start).max(axis=-1) >= min_width
     counted, stays = periods.weight * moved, region == there
-    corner, sides = abstraction.lower, abstraction.upper - abstraction.lower
-    dimension = jnp.arange(sides.shape[1])
-
-    def part(point: Float[Array, "N d"]) -> Array:
-        share = (point - corner[region]) / sides[region]
-        return jnp.clip(jnp.floor(PLANES * share), 0, PLANES - 1).astype(jnp.int32)
-
-    def count(parts: Array, weight: Float[Array, "N"]) -> Float[Array, "R d parts"]:
-        """How many are in each part."""
-        return jnp.zeros((*sides.shape, PLANES)).at[region[:, None], dimension, parts].add(weight[:, None])
-
-    def below(parts: Array, weight: Float[Array, "N"]) -> Float[Array, "R d planes"]:
-        """How many are in parts below each plane."""
-        return jnp.cumsum(count(parts, weight), axis=-1)[..., :-1]
-
-    began, ended = part(periods.start), part(periods.end)
-    led = jnp.zeros((*sides.shape, PLANES, len(sides)))
-    led = led.at[region[:, None], dimension, began, there[:, None]].add((counted * ~stays)[:, None])
+    began, ended = (_part(abstraction, region, point) for point in (periods.start, periods.end))
+    capacity, d = abstraction.lower.shape
+    led = jnp.zeros((capacity, d, PLANES, capacity))
+    led = led.at[region[:, None], jnp.arange(d), began, there[:, None]].add((counted * ~stays)[:, None])
     out_below = jnp.cumsum(led, axis=2)[:, :, :-1]
     out_above = led.sum(axis=2, keepdims=True) - out_below
 
     staying = counted * stays
-    total = jnp.zeros(len(sides)).at[region].add(staying)[:, None, None]
-    from_below, to_below = below(began, staying), below(ended, staying)
-    both_below = below(jnp.maximum(began, ended), staying)
-    both_above = total - below(jnp.minimum(began, ended), staying)
+    below = lambda parts: _below(abstraction, region, parts, staying)  # noqa: E731
+    total = jnp.zeros(capacity).at[region].add(staying)[:, None, None]
+    from_below, to_below = below(began), below(ended)
+    both_below = below(jnp.maximum(began, ended))
+    both_above = total - below(jnp.minimum(began, ended))
     up, down = from_below - both_below, to_below - both_below
 
     number_below, number_above = (
@@ -74,26 +92,68 @@ def cuts(
     common = lambda low, high: jnp.minimum(low / number_below, high / number_above)  # noqa: E731
     overlap = jnp.minimum(out_below / number_below[..., None], out_above / number_above[..., None]).sum(axis=-1)
     overlap += common(both_below, down) + common(up, both_above)
-
     fewer = jnp.minimum(number_below, number_above)
-    inside = jnp.arange(1, PLANES) / PLANES * sides[..., None]
-    wide = (inside >= min_width) & (sides[..., None] - inside >= min_width)
-    sound = wide & (fewer >= LEAST) & (overlap <= OVERLAP) & abstraction.active[:, None, None]
-    entered = count(began, periods.weight) + count(ended, periods.weight * stays) > 0
-    score = jnp.where(sound, fewer + _room(entered) / PLANES, 0.0)
-    return _best(score, corner[..., None] + inside), jnp.floor(score.max(axis=(1, 2)))
+    return jnp.where((fewer >= LEAST) & (overlap <= OVERLAP), fewer, 0.0)
 
 
-def _best(score: Float[Array, "R d planes"], position: Float[Array, "R d planes"]) -> Cut:
+def _not_passed(abstraction: Abstraction, goals: Outcome, reached: Bool[Array, "M"]) -> Planes:
+    """The periods towards goals beyond each plane that agents do not pass; 0 at all others."""
+    goal = (goals.lower + goals.upper) / 2
+    region, goal_region, there = (regions.locate(abstraction, point) for point in (goals.start, goal, goals.end))
+    began, wanted, ended = (_part(abstraction, region, point) for point in (goals.start, goal, goals.end))
+    weight = goals.weight * (region == goal_region)
+    low, high = jnp.minimum(began, wanted), jnp.maximum(began, wanted)
+    got = jnp.clip(jnp.where((there == region)[:, None], ended, began), low, high)  # so far on the way to the goal
+    below = lambda parts, weight: _below(abstraction, region, parts, weight)  # noqa: E731
+    tried = below(low, weight) - below(high, weight)
+    passed = below(jnp.minimum(began, got), weight) - below(jnp.maximum(began, got), weight)
+
+    def on_own_side(weight: Float[Array, "M"]) -> Planes:
+        total = jnp.zeros(len(abstraction.lower)).at[region].add(weight)[:, None, None]
+        return below(high, weight) + total - below(low, weight)
+
+    able = on_own_side(weight * reached) >= ABLE * jnp.maximum(on_own_side(weight), TRIES)
+    return jnp.where((tried >= TRIES) & (passed <= PASSED * tried) & able, tried, 0.0)
+
+
+def _part(abstraction: Abstraction, region: Int[Array, "N"], point: Float[Array, "N d"]) -> Parts:
+    """In which of the PLANES parts of its `region` each point is, along each dimension."""
+    lower, upper = abstraction.lower[region], abstraction.upper[region]
+    share = (point - lower) / (upper - lower)
+    return jnp.clip(jnp.floor(PLANES * share), 0, PLANES - 1).astype(jnp.int32)
+
+
+def _count(
+    abstraction: Abstraction, region: Int[Array, "N"], parts: Parts, weight: Float[Array, "N"]
+) -> Float[Array, "R d parts"]:
+    """How many are in each part."""
+    capacity, d = abstraction.lower.shape
+    return jnp.zeros((capacity, d, PLANES)).at[region[:, None], jnp.arange(d), parts].add(weight[:, None])
+
+
+def _below(abstraction: Abstraction, region: Int[Array, "N"], parts: Parts, weight: Float[Array, "N"]) -> Planes:
+    """How many are in parts below each plane."""
+    return jnp.cumsum(_count(abstraction, region, parts, weight), axis=-1)[..., :-1]
+
+
+def _best(score: Planes, position: Planes) -> Cut:
     """The plane of each region that has the largest score."""
     each = jnp.arange(len(score))
     along, plane = jnp.unravel_index(jnp.argmax(score.reshape(len(score), -1), axis=1), score.shape[1:])
     return Cut(region=each, dimension=along, position=position[each, along, plane])
 
 
-def _room(entered: Bool[Array, "R d parts"]) -> Int[Array, "R d planes"]:
-    """How many parts on the nearer side of each plane nobody has `entered`, below PLANES / 2."""
+def _free(abstraction: Abstraction, periods: Outcome, goals: Outcome) -> Bool[Array, "R d parts"]:
+    """The parts of each region that are free somewhere: periods began or ended there, or a goal lies there."""
+    points = jnp.concatenate([periods.start, periods.end, (goals.lower + goals.upper) / 2])
+    weight = jnp.concatenate([periods.weight, periods.weight, goals.weight])
+    region = regions.locate(abstraction, points)
+    return _count(abstraction, region, _part(abstraction, region, points), weight) > 0
+
+
+def _room(free: Bool[Array, "R d parts"]) -> Int[Array, "R d planes"]:
+    """How many parts there are from each plane to the nearest `free` one, below PLANES / 2."""
     index = jnp.arange(PLANES)
-    under = jax.lax.cummax(jnp.where(entered, index, -1), axis=2)[..., :-1]
-    over = jax.lax.cummin(jnp.where(entered, index, PLANES), axis=2, reverse=True)[..., 1:]
+    under = jax.lax.cummax(jnp.where(free, index, -1), axis=2)[..., :-1]
+    over = jax.lax.cummin(jnp.where(free, index, PLANES), axis=2, reverse=True)[..., 1:]
     return jnp.minimum(index[:-1] - under, over - index[1:])

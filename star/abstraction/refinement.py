@@ -15,8 +15,7 @@ With `within`, pairs (i, i) are examined too: does a region reach the goals insi
 in i whose goal lies in i. One of their goals is drawn, if possible one that was reached, and the square inside its
 circle of success is the box to reach. Only cuts come of it, no verdicts, since the next goal may be another one.
 
-With `separate`, regions are cut besides where agents move on both sides of a plane and nobody passes it
-(star/abstraction/passages.py).
+With `separate`, regions are cut besides along planes that agents do not pass (star/abstraction/passages.py).
 
 Source: STAR (ICLR 2024), section 4.3 and algorithm 2.
 """
@@ -80,23 +79,6 @@ class Graph(struct.PyTreeNode):
     def misses(self) -> Bool[Array, "*seeds R R"]:
         """Pairs shown unreachable, and not yet forgotten."""
         return self.verdict == MISSES
-
-
-class Goals(struct.PyTreeNode):
-    """Boxes around task goals that were commanded of late, and whether they were reached; `weight` masks."""
-
-    lower: Float[Array, "N d"]
-    upper: Float[Array, "N d"]
-    reached: Bool[Array, "N"]
-    weight: Float[Array, "N"]
-
-    @classmethod
-    def of(cls, outcome: Outcome, at_goal: Bool[Array, "*N"], *, cube: float) -> Goals:
-        """The outcomes commanded `at_goal`; goals count as reached within so many units of each coordinate."""
-        away = jnp.maximum(outcome.lower - outcome.end, outcome.end - outcome.upper)
-        half = (outcome.upper - outcome.lower) / 2
-        reached = jnp.all(away <= _widening(half, cube), axis=-1)
-        return cls(lower=outcome.lower, upper=outcome.upper, reached=reached, weight=outcome.weight * at_goal)
 
 
 def init(*, capacity: int) -> Graph:
@@ -176,7 +158,7 @@ def refine(
     abstraction: Abstraction,
     graph: Graph,
     model: ForwardModelState,
-    goals: Goals,
+    goals: Outcome,
     *,
     cube: float | Array,
     weight: Float[Array, "R"] | float = 1.0,
@@ -219,7 +201,7 @@ def refine(
     (abstraction, graph), (splits, found, mixed) = jax.lax.scan(
         one_pair, (abstraction, graph), jax.random.split(key, config.refinement.pairs_per_epoch)
     )
-    abstraction, graph, more = _separate(config, abstraction, graph, periods)
+    abstraction, graph, more = _separate(config, abstraction, graph, periods, goals, cube=cube)
     splits = jax.tree.map(lambda x, other: jnp.concatenate([x.reshape(-1), other]), splits, more)
     metrics = {
         "examined": found.sum(),
@@ -234,10 +216,12 @@ def refine(
 
 
 def _separate(
-    config: Settings, abstraction: Abstraction, graph: Graph, periods: Outcome
+    config: Settings, abstraction: Abstraction, graph: Graph, periods: Outcome, goals: Outcome, *, cube: float | Array
 ) -> tuple[Abstraction, Graph, Split]:
     """Cut regions where nobody passes, if that is wanted, those first in which most move on either side."""
-    cuts, evidence = passages.cuts(abstraction, periods, min_width=config.abstraction.min_width)
+    cuts, evidence = passages.cuts(
+        abstraction, periods, goals, reached(goals, cube), min_width=config.abstraction.min_width
+    )
     worst = jnp.argsort(-evidence)[: _SEPARATED * config.refinement.separate]
 
     def one(carry: tuple[Abstraction, Graph], chosen: tuple[Cut, Array]) -> tuple[tuple[Abstraction, Graph], Split]:
@@ -286,20 +270,26 @@ def on_split(graph: Graph, split: Split) -> Graph:
     return where(split.done, parts, graph)
 
 
+def reached(goals: Outcome, cube: float | Array) -> Bool[Array, "N"]:
+    """Whether the goals, boxes that were commanded, were reached: within `cube` units of each coordinate."""
+    away = jnp.maximum(goals.lower - goals.end, goals.end - goals.upper)
+    return jnp.all(away <= _widening((goals.upper - goals.lower) / 2, cube), axis=-1)
+
+
 def _widening(half: Float[Array, "*n d"], cube: float | Array) -> Float[Array, "*n d"]:
     """What a box of half-widths `half` lacks to a cube of half-width `cube`."""
     return jnp.maximum(cube - half, 0.0)
 
 
 def _boxes(
-    abstraction: Abstraction, region: Array, target: Array, goals: Goals, *, cube: float | Array, key: Array
+    abstraction: Abstraction, region: Array, target: Array, goals: Outcome, *, cube: float | Array, key: Array
 ) -> tuple[tuple[Array, Array], tuple[Array, Array], Bool[Array, ""]]:
     """The box that is commanded to examine a pair, the box that is to be reached, and whether there is one.
 
     Both are the target region, or where that is the region itself the box around a goal in it, and the widened one.
     """
     inside = region == target
-    goal, there = _draw_goal(abstraction, region, goals, key=key)
+    goal, there = _draw_goal(abstraction, region, goals, cube=cube, key=key)
     commanded = (
         jnp.where(inside, goal[0], abstraction.lower[target]),
         jnp.where(inside, goal[1], abstraction.upper[target]),
@@ -309,12 +299,12 @@ def _boxes(
 
 
 def _draw_goal(
-    abstraction: Abstraction, region: Array, goals: Goals, *, key: Array
+    abstraction: Abstraction, region: Array, goals: Outcome, *, cube: float | Array, key: Array
 ) -> tuple[tuple[Array, Array], Bool[Array, ""]]:
     """The box around a random goal inside `region`, one that was reached if possible, and whether there is one."""
     centre = (goals.lower + goals.upper) / 2
     inside = jnp.all((abstraction.lower[region] <= centre) & (centre <= abstraction.upper[region]), axis=-1)
-    chance = inside * goals.weight * (1.0 + goals.reached + jax.random.uniform(key, goals.weight.shape))
+    chance = inside * goals.weight * (1.0 + reached(goals, cube) + jax.random.uniform(key, goals.weight.shape))
     drawn = jnp.argmax(chance)
     return (goals.lower[drawn], goals.upper[drawn]), chance[drawn] > 0
 

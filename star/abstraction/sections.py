@@ -64,7 +64,7 @@ class RefinementConfig(Section):
     pairs_per_epoch: Repeats = Field(16, description="pairs examined after each epoch")
     cuts: Literal["best", "random"] = Field("best", description="where a region is cut; random is for comparison")
     cuts_per_pair: Repeats = Field(1, description="cuts one examined pair may make")
-    separate: bool = Field(True, description="cut a region too where agents move on both sides and nobody passes")
+    separate: bool = Field(True, description="cut a region too along a plane that agents do not pass")
     miss_lifetime: Annotated[int, Field(ge=0, lt=2**31)] = Field(
         2, description="a MISSES verdict older than so many epochs is forgotten; with 0 there is none"
     )

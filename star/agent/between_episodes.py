@@ -17,7 +17,6 @@ from jaxtyping import Array
 
 from star.abstraction import forward_model, refinement
 from star.abstraction.forward_model import Outcome
-from star.abstraction.refinement import Goals
 from star.agent import commander
 from star.agent.decisions import Decision, Finished, Roadmap
 from star.agent.sections import AgentConfig
@@ -56,7 +55,7 @@ def learn(
     metrics["commander/ground"] = _ground(spec, finished.outcome)
     periods = num_envs * (spec.episode_length // section.period)
     decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
-    goals = Goals.of(outcome, decision.at_goal, cube=spec.cube)
+    goals = outcome.replace(weight=outcome.weight * decision.at_goal)
     state, more = _learn_where_commands_lead(config, state, decision, outcome, key=train_key)
     metrics |= more
     if config.refinement.enabled:
@@ -81,7 +80,7 @@ def refine(
     spec: Spec,
     guide: ModuleType,
     state: TrainState,
-    goals: Goals,
+    goals: Outcome,
     *,
     known: CommanderState,
     finished: Finished,

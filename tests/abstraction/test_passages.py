@@ -7,7 +7,7 @@ import pytest
 
 from star.abstraction import passages, regions
 from star.abstraction.forward_model import Outcome
-from star.abstraction.passages import LEAST, OVERLAP, PLANES
+from star.abstraction.passages import ABLE, LEAST, OVERLAP, PASSED, PLANES, TRIES
 
 SPACE = ((0.0, 0.0), (16.0, 8.0))
 CUTS = jax.jit(passages.cuts)
@@ -24,9 +24,19 @@ def halves(*, max_regions=4):
     return regions.create(SPACE, ((8.0,), ()), max_regions=max_regions)
 
 
-def found(periods, *, min_width=1.0):
+NOWHERE = periods([], [])
+
+
+def towards(start, goal, end):
+    """Periods in which agents were given the box +-1 around a goal, and whether they ended in it."""
+    start, goal, end = (np.asarray(points, np.float32).reshape(-1, 2) for points in (start, goal, end))
+    sent = Outcome(start=start, lower=goal - 1, upper=goal + 1, end=end, weight=np.ones(len(start), np.float32))
+    return sent, np.abs(end - goal).max(axis=1) <= 1
+
+
+def found(periods, goals=None, *, min_width=1.0):
     """(cut, evidence) of the region [0, 8)."""
-    cuts, evidence = CUTS(halves(), periods, min_width=min_width)
+    cuts, evidence = CUTS(halves(), periods, *(goals or towards([], [], [])), min_width=min_width)
     return jax.tree.map(lambda x: x[0], cuts), float(evidence[0])
 
 
@@ -108,7 +118,7 @@ def test_cuts_are_those_of_a_slow_count(seed):
     more = walking(rng, 30, (0, 0), (16, 8))
     start, end = (np.concatenate([a, b]).astype(np.float32) for a, b in ((start, more[0]), (end, more[1])))
     moved = np.abs(end - start).max(axis=1) >= 1.0
-    cuts, evidence = CUTS(abstraction, periods(start, end), min_width=1.0)
+    cuts, evidence = CUTS(abstraction, periods(start, end), *towards([], [], []), min_width=1.0)
     start, end = start[moved], end[moved]
     ways = (*(np.asarray(regions.locate(abstraction, points)) for points in (start, end)), start, end)
     lower, upper = np.asarray(abstraction.lower), np.asarray(abstraction.upper)
@@ -130,6 +140,70 @@ def test_cuts_are_those_of_a_slow_count(seed):
 
 
 def test_regions_not_in_use_are_not_cut():
-    cuts, evidence = CUTS(halves(), periods(*two_rooms(np.random.default_rng(5))), min_width=1.0)
+    cuts, evidence = CUTS(halves(), periods(*two_rooms(np.random.default_rng(5))), *towards([], [], []), min_width=1.0)
     np.testing.assert_array_equal(evidence[2:], 0.0)
     assert jnp.isfinite(cuts.position).all()
+
+
+def before_a_wall(rng, *, own=60, across=30, passing=0, able=1.0):
+    """Goals in the same room below y = 3, of which a share is reached, and goals above y = 5, before which all stop."""
+    start, goal = walking(rng, own + across, (0, 0), (8, 3))
+    goal[own:, 1] += 5
+    end = np.where(rng.uniform(size=len(start)) < able, goal.T, start.T).T
+    stop = slice(own, own + across - passing)
+    end[stop, 1] = 2.9
+    return start, goal, end
+
+
+def test_a_region_is_cut_between_agents_and_goals_that_they_never_reach():
+    """Nobody has been beyond the wall."""
+    start, goal, end = before_a_wall(np.random.default_rng(6))
+    cut, evidence = found(periods(start, end), towards(start, goal, end))
+    assert (int(cut.region), int(cut.dimension)) == (0, 1) and evidence == 30
+    assert float(cut.position) == pytest.approx((2.9 + goal[60:, 1].min()) / 2, abs=8 / PLANES)
+
+
+PASSABLE = {
+    "enough pass": dict(passing=15),
+    "agents reach few goals in their own room too": dict(able=0.4),
+    "too few tries": dict(across=TRIES - 1),
+    "too few goals in their own room": dict(own=4),
+}
+
+
+@pytest.mark.parametrize("case", PASSABLE)
+def test_goals_that_are_not_reached_for_another_reason_cut_nothing(case):
+    start, goal, end = before_a_wall(np.random.default_rng(7), **PASSABLE[case])
+    assert found(NOWHERE, towards(start, goal, end))[1] == 0
+
+
+def test_goals_in_another_region_and_ends_there_count_for_nothing():
+    start, goal, end = before_a_wall(np.random.default_rng(8))
+    across = slice(60, None)
+    goal[across, 0] += 8
+    assert found(NOWHERE, towards(start, goal, end))[1] == 0
+    goal[across, 0] -= 8
+    end[across] = (12, 7)  # beyond the plane, but in the other region
+    assert found(NOWHERE, towards(start, goal, end))[1] == 30
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_planes_that_are_not_passed_are_those_of_a_slow_count(seed):
+    rng = np.random.default_rng(seed)
+    start, goal, end = before_a_wall(rng, passing=2)
+    more = [rng.uniform((0, 0), (16, 8), (20, 2)) for _ in range(3)]
+    start, goal, end = (np.concatenate(pair).astype(np.float32) for pair in zip((start, goal, end), more, strict=True))
+    cut, evidence = found(NOWHERE, (sent := towards(start, goal, end)))
+    within = (start[:, 0] < 8) & (goal[:, 0] < 8)
+    counts = {}
+    for dimension in range(2):
+        for k in range(4, PLANES - 3):
+            below = lambda points: points[:, dimension] < k / 4  # noqa: E731, B023
+            across = within & (below(start) != below(goal))
+            passed = across & (below(end) == below(goal)) & (end[:, 0] < 8)
+            own = within & ~across
+            able = (own & sent[1]).sum() >= ABLE * max(own.sum(), TRIES)
+            if able and across.sum() >= TRIES and passed.sum() <= PASSED * across.sum():
+                counts[dimension, k / 4] = across.sum()
+    assert counts and evidence == max(counts.values())
+    assert counts[int(cut.dimension), float(cut.position)] == evidence

@@ -10,7 +10,7 @@ import pytest
 from star.abstraction import cutting, forward_model, refinement, regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.reachability import MISSES, REACHES, UNKNOWN, Leaves
-from star.abstraction.refinement import Goals, Graph
+from star.abstraction.refinement import Graph
 from star.abstraction.regions import Cut, Split
 from star.config import loading
 from star.learners import replay
@@ -73,7 +73,7 @@ def moving():
     return make
 
 
-NO_GOALS = Goals(lower=jnp.zeros((1, 2)), upper=jnp.zeros((1, 2)), reached=jnp.zeros(1, bool), weight=jnp.zeros(1))
+NO_GOALS = Outcome(*jnp.zeros((4, 1, 2)), weight=jnp.zeros(1))
 
 
 @pytest.fixture(scope="module")
@@ -419,10 +419,11 @@ DEEP = settings(**{"refinement.depth": 5})  # leaves of 1.5 by 3
 
 
 def goal_boxes(*centres, reached=()):
-    """Goals with boxes of +-1; those whose numbers are in `reached` were reached."""
-    centre = jnp.array(centres, jnp.float32)
+    """Periods towards goals with boxes of +-1; those whose numbers are in `reached` ended there."""
+    centre, start = jnp.array(centres, jnp.float32), jnp.full((len(centres), 2), -100.0)
     mask = jnp.isin(jnp.arange(len(centres)), jnp.array(reached, int))
-    return Goals(lower=centre - 1, upper=centre + 1, reached=mask, weight=jnp.ones(len(centres)))
+    end = jnp.where(mask[:, None], centre, start)
+    return Outcome(start=start, lower=centre - 1, upper=centre + 1, end=end, weight=jnp.ones(len(centres)))
 
 
 def test_a_region_that_reaches_a_goal_inside_it_only_from_a_part_is_cut(refine, moving):
@@ -450,13 +451,11 @@ def test_a_goal_that_was_reached_is_preferred(refine, moving):
         assert int(refine(DEEP, grid(), knowing((0, 0)), moving((6, 0)), goals)[0].count) == count
 
 
-def test_goals_come_from_decisions_at_the_goal_and_count_as_reached_within_the_circle_of_success():
-    box = jnp.array([[5.0, 5.0]] * 4)
-    end = jnp.array([[5.0, 7.0], [5.0, 7.2], [6.9, 3.1], [5.0, 5.0]])
-    outcome = Outcome(start=box, lower=box - 1, upper=box + 1, end=end, weight=jnp.array([1.0, 1.0, 1.0, 0.0]))
-    goals = Goals.of(outcome, jnp.array([True, True, False, True]), cube=3.0 / 2**0.5)
-    assert goals.reached.tolist() == [True, False, True, True]
-    assert goals.weight.tolist() == [1, 1, 0, 0]
+def test_goals_count_as_reached_within_the_circle_of_success():
+    box = jnp.array([[5.0, 5.0]] * 3)
+    end = jnp.array([[5.0, 7.0], [5.0, 7.2], [6.9, 3.1]])
+    goals = Outcome(start=box, lower=box - 1, upper=box + 1, end=end, weight=jnp.ones(3))
+    assert refinement.reached(goals, 3.0 / 2**0.5).tolist() == [True, False, True]
 
 
 def test_random_cuts_come_at_the_same_time_but_anywhere(refine, moving):

@@ -276,8 +276,7 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
             stable=state.graph.stable.at[0, target].set(True),
         ),
     )
-    nowhere = jnp.zeros((1, 2))
-    goals = refinement.Goals(lower=nowhere, upper=nowhere, reached=jnp.zeros(1, bool), weight=jnp.zeros(1))
+    goals = Outcome(*jnp.zeros((4, 1, 2)), weight=jnp.zeros(1))
 
     @jax.jit
     def refined(state):
