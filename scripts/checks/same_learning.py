@@ -46,7 +46,7 @@ EPOCHS, FRESH, FROM = 5, 4, 2  # that OLD trains; after which both are compared;
 METRICS = 1e-6  # how far metrics may be apart
 ROUNDING = 1e-5  # how far numbers of a `close` row may be apart, over the largest of their leaf
 CLOCKS = ("wall_s", "env_steps_per_s")  # metrics that tell of the machine
-HASTY = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+HASTY = "--xla_backend_optimization_level=0"
 COMMAND = "import sys; from star.cli import main; sys.exit(main())"
 
 # Plants: what runs before the command, to spoil it.
