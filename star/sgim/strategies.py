@@ -92,6 +92,18 @@ def available(config: SgimConfig, state: SgimState, *, key: Array) -> Bool[Array
     return (jax.random.uniform(key, share.shape) < share) & (asked < _budgets(config))
 
 
+def by_what_is_mastered(
+    state: SgimState, *, start: Float[Array, "B d"], goal: Float[Array, "B d"], key: Array
+) -> Float[Array, "B d"]:
+    """What is mastered best in a region, drawn evenly."""
+    via = jax.random.randint(key, goal.shape[:1], 0, state.abstraction.count)
+    return selection.mastered(state)[via]
+
+
+ROUTES = {"decomposition": by_what_is_mastered}
+"""Strategies that go to the goal by way of a point: the function that chooses it."""
+
+
 def _prepare(
     config: SgimConfig,
     state: SgimState,
@@ -106,11 +118,11 @@ def _prepare(
     length = max([1, *(demos.waypoints.shape[1] for demos in teachers)])
     goal = choice.goal
     waypoints, guided = jnp.repeat(goal[:, None], length, axis=1), jnp.zeros(len(goal), bool)
-    if "decomposition" in config.strategies:
-        mine = choice.strategy == config.strategies.index("decomposition")
-        via = jax.random.randint(key, mine.shape, 0, state.abstraction.count)
-        by_way_of = selection.mastered(state)[via]
-        waypoints, guided = jnp.where(mine[:, None, None], by_way_of[:, None], waypoints), guided | mine
+    for number, name in enumerate(config.strategies):
+        if name in ROUTES:
+            mine = choice.strategy == number
+            via = ROUTES[name](state, start=start, goal=goal, key=key)
+            waypoints, guided = jnp.where(mine[:, None, None], via[:, None], waypoints), guided | mine
     for number, (teacher, demos) in enumerate(zip(config.teachers, teachers, strict=True), len(config.strategies)):
         mine = taught & (choice.strategy == number)
         if teacher.kind == "decomposition":
