@@ -3,7 +3,8 @@
 >>> arena = envs.read_arena("room.txt", cell=4.0)
 >>> env = envs.MazeEnv.of("car_room", envs.Robot("car.xml", arena), arena)
 
-    state   qpos, then qvel, as MuJoCo has them: position (x, y) first
+    state   qpos, then qvel, as MuJoCo has them: position (x, y) first; the angle of a hinge without a range, such as a
+            wheel's, in [-pi, pi]
     action  one number in [-1, 1] for each actuator, over its `ctrlrange`
     start   the pose of the XML at the start's place, with noise
 
@@ -69,6 +70,8 @@ class Robot:
         low, high = model.actuator_ctrlrange.T.astype(np.float32)
         self._middle, self._half = (low + high) / 2, (high - low) / 2
         self._start = np.array(model.qpos0, np.float32)
+        turning = (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE) & (model.jnt_limited == 0)
+        self._turning = np.isin(np.arange(model.nq), model.jnt_qposadr[turning])
         self.state_dim: int = model.nq + model.nv
         self.action_size: int = model.nu
         self.orientation: tuple[int, ...] = (3, 4, 5, 6) if self._free else ()
@@ -97,7 +100,8 @@ class Robot:
 
     def observe(self, data: PhysicsState, steps: jax.Array) -> jax.Array:
         """The state [state_dim], `steps` env steps into the episode."""
-        return jnp.concatenate([data.qpos, data.qvel])
+        wrapped = jnp.arctan2(jnp.sin(data.qpos), jnp.cos(data.qpos))
+        return jnp.concatenate([jnp.where(self._turning, wrapped, data.qpos), data.qvel])
 
     def displace(self, data: PhysicsState, offset: jax.Array) -> PhysicsState:
         """The robot moved by `offset` [2]; the solver corrects what gets into a wall."""

@@ -5,6 +5,8 @@ import re
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -97,6 +99,15 @@ def test_a_robot_from_an_xml_stands_in_a_room_from_a_map(trusted):
     assert environment.engine_of(config("car:make"), made) == "native"
     with pytest.raises(UserError, match=r'env: engine is "jax", but room:make takes no engine; allowed: auto'):
         environment.make(loading.parse({"env": {"name": "room:make", "engine": "jax"}}), "train")
+
+
+def test_the_angles_of_wheels_stay_within_a_turn_and_all_else_is_as_mujoco_has_it(trusted):
+    body = environment.make(config("car:make"), "test").body
+    data = body.init(jax.random.key(0), jnp.zeros(2))
+    turned = data.replace(qpos=data.qpos.at[7:].set(jnp.array([7.0, -10.0])))
+    expected = np.concatenate([turned.qpos, turned.qvel])
+    expected[7:9] = [7 - 2 * np.pi, -10 + 4 * np.pi]
+    np.testing.assert_allclose(body.observe(turned, 0), expected, atol=1e-5)
 
 
 def test_a_robot_is_drawn(trusted, can_draw):
