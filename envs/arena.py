@@ -153,7 +153,7 @@ def read_arena(source: str, *, cell: float) -> Arena:
     source = source.strip()
     name, text = "map" if "\n" in source else f"map {_short(source)}", load(source)
     yaml_map = re.search(r"^\s*\w+\s*:", text, re.M)
-    arena = check(_from_yaml(text, cell, name=name) if yaml_map else Arena(_rows(text), cell), name=name)
+    arena = check(_from_yaml(text, cell, name=name) if yaml_map else Arena(_rows(text), _size(cell, name)), name=name)
     sealed = unreached(arena)
     if sealed:
         r, c = sealed[0]
@@ -183,6 +183,13 @@ def _rows(text: str) -> tuple[str, ...]:
     return tuple(line.strip() for line in text.strip().splitlines())
 
 
+def _size(cell: Any, name: str) -> float:
+    """The size of cells in m; raises `EnvError` if it is none."""
+    if type(cell) not in (int, float) or not CELL_SIZES[0] <= cell <= CELL_SIZES[1]:
+        raise EnvError(f"{name}: cell is {shown(cell)}; allowed: {CELL_SIZES[0]} to {CELL_SIZES[1]} m")
+    return float(cell)
+
+
 def _from_yaml(text: str, cell: float, *, name: str) -> Arena:
     try:
         values = reading.plain(text)
@@ -195,11 +202,9 @@ def _from_yaml(text: str, cell: float, *, name: str) -> Arena:
     for key in given:
         if key not in ("map", "cell", "block"):
             raise EnvError(f'{name}: key "{_short(str(key))}" is unknown; allowed: map, cell, block')
-    if type(given["cell"]) not in (int, float) or not CELL_SIZES[0] <= given["cell"] <= CELL_SIZES[1]:
-        raise EnvError(f"{name}: cell is {shown(given['cell'])}; allowed: {CELL_SIZES[0]} to {CELL_SIZES[1]} m")
     if given["block"] not in BLOCK_AXES:
         raise EnvError(f"{name}: block is {shown(given['block'])}; allowed: {', '.join(BLOCK_AXES)}")
-    return Arena(_rows(values["map"]), float(given["cell"]), given["block"])
+    return Arena(_rows(values["map"]), _size(given["cell"], name), given["block"])
 
 
 def check(arena: Arena, *, name: str) -> Arena:

@@ -15,9 +15,7 @@ has to have before anything runs. What it gives besides:
 from __future__ import annotations
 
 import math
-import traceback
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NoReturn, Protocol
 
 import jax
@@ -28,14 +26,14 @@ from flax import struct
 from envs._quiet import Env, State
 from envs.common import modes
 from envs.common.batching import where
-from envs.common.errors import shown
+from envs.common.errors import shown, where_raised
 from envs.maze import MazeEnv, all_finite
 from envs.options import EnvError
 
 Corner = Sequence[float]
 
+DRAWN = ("model", "pose", "arena")  # what pictures need
 TRIED = 64  # episodes that are begun to see what goals they have
-_HERE = Path(__file__).parent
 ZEROS = ("non_finite", "overflow", "flipped", "fallen")  # metrics that an environment need not have
 
 
@@ -192,10 +190,15 @@ def adapt(env: Any, *, name: str) -> MazeEnv | Adapted:
 
 def need(env: Any, feature: str, *attributes: str) -> None:
     """Raise `EnvError` in one line if `env` lacks one of the attributes that `feature` needs."""
-    own = getattr(env, "_env", env)
     for attribute in attributes:
-        if getattr(own, attribute, None) is None:
+        if not has(env, attribute):
             raise EnvError(f"{env.name} has no {attribute}, which {feature} needs; see envs.GoalEnv")
+
+
+def has(env: Any, *attributes: str) -> bool:
+    """Whether the user's own environment has all of these attributes."""
+    own = getattr(env, "_env", env)
+    return all(getattr(own, attribute, None) is not None for attribute in attributes)
 
 
 def _told(wrapped: Wrapped, info: dict[str, Any], *, done: jax.Array, non_finite: jax.Array) -> State:
@@ -249,7 +252,7 @@ def _check_attributes(env: Any, name: str) -> None:
     d = len(getattr(env, "abstract_indices", env.goal_indices))
     space = _numbers(getattr(env, "space", None))
     if space is None or space.shape != (2, d) or not (space[0] < space[1]).all():
-        refuse("space", f"lower and upper corner, {d} numbers each, one for each abstract dimension")
+        refuse("space", f"lower corner, then upper corner, {d} numbers each, one for each abstract dimension")
     scale = _numbers(getattr(env, "subgoal_scale", None))
     if scale is None or scale.shape != (d,) or not (scale > 0).all():
         refuse("subgoal_scale", f"{d} numbers above 0, one for each abstract dimension")
@@ -316,20 +319,6 @@ def _called(function: Callable[..., Any], *args: Any, name: str, what: str, run:
         return run(function, *args)
     except Exception as error:  # whatever its author has done
         raise EnvError(f"{name}: {what} raises {where_raised(error)}") from error
-
-
-def where_raised(error: Exception) -> str:
-    """An error in one line: its kind, the first line of what it says, and where its author's own code raised it."""
-    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_authors(frame.filename)]
-    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
-    lines = str(error).strip().splitlines() or [""]
-    return f"{type(error).__name__}: {lines[0]}{place}"
-
-
-def _is_authors(file: str) -> bool:
-    """Whether a file is neither this package's nor an installed one's."""
-    path = Path(file)
-    return path.is_file() and not {"site-packages", "dist-packages"} & set(path.parts) and _HERE not in path.parents
 
 
 def _run(function: Callable[..., Any], *args: Any) -> Any:

@@ -12,7 +12,9 @@ An episode that has ended before its time stays as it is until the next reset.
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
+from numbers import Integral, Real
 from typing import Any, Protocol
 
 import jax
@@ -22,6 +24,7 @@ from flax import struct
 
 from envs._quiet import Env, State
 from envs.arena import Arena
+from envs.common.errors import shown
 from envs.options import EnvError, known
 from envs.places import Places
 from envs.tasks import ENDS, Switch, Task, on_map
@@ -173,9 +176,8 @@ class MazeEnv(Env):
             if word not in words:
                 raise EnvError(f"{name}: {what} is {word!r}; {known(str(word), words)}")
         radius = task.success_radius if success_radius is None else success_radius
-        for what, number in (("episode_length", episode_length), ("success_radius", radius)):
-            if not number > 0:
-                raise EnvError(f"{name}: {what} is {number!r}; allowed: a number above 0")
+        _check_number(f"{name}: episode_length", episode_length, Integral, "a whole number above 0")
+        _check_number(f"{name}: success_radius", radius, Real, "a number above 0")
         return cls(
             name,
             task,
@@ -337,6 +339,11 @@ def sample(places: Places, rng: jax.Array) -> jax.Array:
 
 def _distance(achieved: Any, desired: Any) -> Any:
     return ((achieved - desired) ** 2).sum(axis=-1) ** 0.5
+
+
+def _check_number(what: str, number: Any, kind: type, allowed: str) -> None:
+    if not isinstance(number, kind) or isinstance(number, bool) or not 0 < number < math.inf:
+        raise EnvError(f"{what} is {shown(number)}; allowed: {allowed}")
 
 
 def all_finite(data: Any) -> jax.Array:

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import math
+import sysconfig
+import traceback
+from pathlib import Path
 from typing import Any
+
+_OURS = [Path(__file__).parents[2] / package for package in ("envs", "star")]
 
 
 class UserError(ValueError):
@@ -26,3 +31,17 @@ def shown(value: Any, limit: int = 60) -> str:
     except ValueError:  # Python does not write whole numbers of thousands of digits
         text = "a number of thousands of digits"
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def where_raised(error: Exception) -> str:
+    """An error in one line: its kind, the first line of what it says, and where its author's own code raised it."""
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_authors(Path(frame.filename))]
+    place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+    lines = str(error).strip().splitlines() or [""]
+    return f"{type(error).__name__}: {lines[0]}{place}"
+
+
+def _is_authors(file: Path) -> bool:
+    """Whether a file is neither this package's, nor an installed one's, nor Python's."""
+    elsewhere = {*_OURS, *(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))}
+    return file.is_file() and not elsewhere & set(file.parents) and "dist-packages" not in file.parts

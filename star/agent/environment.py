@@ -12,6 +12,7 @@ from typing import Any
 
 import envs
 from envs import goal_env
+from envs.common.errors import where_raised
 from envs.options import known
 from star.agent.sections import Config
 from star.config import plugins
@@ -50,8 +51,11 @@ def _factory(name: str) -> Callable[..., Any]:
         found: Any = plugins.find(name, object)
     except ConfigError as error:
         raise ConfigError(f"{name}: {error}") from None
-    if not callable(found):
-        raise ConfigError(f"{name}: is a {type(found).__name__}; allowed: a function that makes an environment")
+    try:
+        inspect.signature(found)
+    except (TypeError, ValueError):  # no function, or one in C
+        allowed = "allowed: a function that makes an environment"
+        raise ConfigError(f"{name}: is a {type(found).__name__}; {allowed}") from None
     return found
 
 
@@ -64,14 +68,20 @@ def _made(name: str, engine: str, options: dict[str, Any]) -> Any:
         options = options | {"engine": engine}
     for option in options:
         if not _takes(factory, option):
+            if option == "goals":
+                raise ConfigError(f"{name}: takes no goals; allowed: def make(goals), which is given train or test")
             taken = [p.name for p in inspect.signature(factory).parameters.values()]
             raise ConfigError(f'option "{option}" is not one of {name}; {known(option, taken)}')
     try:
-        return factory(**options)
+        made = factory(**options)
     except envs.UserError as error:
         raise ConfigError(f"{name}: {error}") from None
     except Exception as error:  # whatever its author has done
-        raise ConfigError(f"{name}: raises {goal_env.where_raised(error)}") from error
+        raise ConfigError(f"{name}: raises {where_raised(error)}") from error
+    if made is None or isinstance(made, type):
+        what = "nothing" if made is None else f"the class {made.__name__}"
+        raise ConfigError(f"{name}: gives {what}; allowed: an environment, see envs.GoalEnv")
+    return made
 
 
 def _takes(factory: Callable[..., Any], option: str) -> bool:

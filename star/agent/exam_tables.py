@@ -29,7 +29,7 @@ def show(rows: Sequence[Row], comparison: Mapping[str, Any] | None, *, again: Se
     """
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH, highlight=False)
     console.print(evaluations(rows))
-    failing = next(((row, seed) for row in rows for seed in row["seeds"] if seed["failed"]), None)
+    failing = next(((row, seed) for row in rows for seed in row["seeds"] if seed["failed"] and row["film"]), None)
     if failing:
         row, seed = failing
         words = ["--run", row["run"], "--checkpoint", row["env_steps"]]

@@ -288,6 +288,7 @@ def _row(entry: _Entry, exam: Exam, trials: Trials, shortest: np.ndarray | None)
         "engine": course.env.engine,
         "env_steps": entry.step,
         "goals": exam.goals,
+        "film": goal_env.has(course.env, *goal_env.DRAWN),
     }
     row |= summary(trials, shortest)
     if len(per_seed) > 1:

@@ -34,7 +34,6 @@ from star.training.checkpoint import agent_number, load_state
 
 MAX_ENVS = 25
 HEIGHTS = ((1, 480), (4, 320), (9, 240), (MAX_ENVS, 180))  # pixels of a tile, by the number of environments
-PICTURES = ("star render", "model", "pose", "arena")  # what needs what of an environment
 _TEST = Exam()
 WIDE = 16 / 9  # the shape that several tiles together come near to
 
@@ -128,7 +127,7 @@ def record_random(config: Config, *, envs: int, steps: int | None, seed: int) ->
     """Actions drawn uniformly from all possible ones."""
     programs.select_device(config.trainer.device)
     env = environment.make(config, "train")
-    goal_env.need(env, *PICTURES)
+    goal_env.need(env, "star render", *goal_env.DRAWN)
     vector = VectorEnv(env, envs, auto_reset=False)
     length = _length(env.episode_length, steps)
 
@@ -165,7 +164,7 @@ def record_run(
         raise ConfigError(f"--episode: {number} is not among 0 to {episodes - 1}; see --episodes")
     course = exams.prepare(config, exam, episodes=episodes, source=run_dir)
     program, env, spec = course.program, course.env, course.spec
-    goal_env.need(env, *PICTURES)
+    goal_env.need(env, "star render", *goal_env.DRAWN)
     length = _length(spec.episode_length, steps)
     index = agent_number(program, run_dir, agent)
     _, states = load_state(program, run_dir, checkpoint)

@@ -137,6 +137,8 @@ def _run(arguments: list[str]) -> int:
         return 0
     if getattr(options, "experiment", None) is not None:
         overrides["experiment"] = options.experiment
+    for module in getattr(options, "modules", []):
+        plugins.check_there(module)
     typed = (*overrides.values(), getattr(options, "task", None))
     for name in (*getattr(options, "modules", []), *filter(plugins.is_plugin, typed)):
         plugins.trust(name.partition(":")[0])

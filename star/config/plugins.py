@@ -1,12 +1,15 @@
 """What users add from a file of their own, named `module:name`.
 
-Configs and run folders may come from strangers, so a module is imported only if its user has said so: typed its name on
-the command line, named it in `STAR_IMPORT` (several with commas between), or imported it before.
+Configs and run folders may come from strangers, so a module is used only if its user has said so: typed its name on the
+command line, or named it in `STAR_IMPORT` (several with commas between); programs call `trust`. That Python has
+imported it already says nothing: it has imported `logging`, whose functions write files.
 """
 
 from __future__ import annotations
 
+import difflib
 import importlib
+import importlib.util
 import os
 import re
 import shlex
@@ -14,6 +17,7 @@ import sys
 from pathlib import Path
 from typing import TypeVar
 
+from envs.common.errors import where_raised
 from star.config.section import ConfigError
 
 TRUSTED = "STAR_IMPORT"  # the environment variable; processes that are started inherit it
@@ -39,9 +43,9 @@ def command(*words: object) -> str:
 
 
 def check_trust(name: str) -> None:
-    """Raise `UserError` in one line, if the module of `name` (`module:name`) must not be imported."""
+    """Raise `UserError` in one line, if the module of `name` (`module:name`) must not be used."""
     module = name.partition(":")[0]
-    if module not in sys.modules and module not in _trusted():
+    if module not in _trusted():
         raise ConfigError(
             f"only a file names it, so it is not imported; type --import {module}, or set {TRUSTED}={module}"
         )
@@ -55,19 +59,38 @@ def find(name: str, kind: type[Kind]) -> Kind:
     """
     check_trust(name)
     module, _, attribute = name.partition(":")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.append(here)
+    _look_here_too()
     try:
-        found = getattr(importlib.import_module(module), attribute, None)
+        holder = importlib.import_module(module)
     except Exception as error:  # whatever its author has done
-        raise ConfigError(f"cannot be imported: {type(error).__name__}: {' '.join(str(error).split())}") from None
+        raise ConfigError(f"cannot be imported: {where_raised(error)}") from None
+    found = getattr(holder, attribute, None)
     if found is None or not isinstance(found, kind):
         allowed = "" if kind is object else f"; allowed: a {kind.__module__}.{kind.__qualname__}"
         if found is None:
-            raise ConfigError(f"{module} holds no {attribute}{allowed}")
+            near = difflib.get_close_matches(attribute, [one for one in vars(holder) if one[0] != "_"], n=1)
+            meant = f" (did you mean {near[0]}?)" if near else ""
+            raise ConfigError(
+                f"{module} holds no {attribute}{meant}{allowed} ({getattr(holder, '__file__', 'built in')})"
+            )
         raise ConfigError(f"is a {'class' if isinstance(found, type) else type(found).__name__}{allowed}")
     return found
+
+
+def check_there(module: str) -> None:
+    """Raise `UserError` in one line, if there is no such module; it is not imported."""
+    _look_here_too()
+    named = NAMED.fullmatch(f"{module}:x") and not module.endswith(".py")
+    if not named or importlib.util.find_spec(module.partition(".")[0]) is None:
+        raise ConfigError(
+            f"--import: {module!r} is no module here; allowed: a name that Python can import, as mine for mine.py"
+        )
+
+
+def _look_here_too() -> None:
+    here = str(Path.cwd())
+    if here not in sys.path:
+        sys.path.append(here)
 
 
 def _trusted() -> list[str]:

@@ -34,6 +34,8 @@ class EnvConfig(Section):
     def _import_nothing_that_only_a_file_names(cls, value: str) -> str:
         if plugins.is_plugin(value):
             plugins.check_trust(value)
+        elif ":" in value:
+            raise ValueError("should be module:function, a module that Python can import: no path, no .py, no hyphen")
         return value
 
     @field_validator("options", "training")

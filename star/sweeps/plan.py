@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from envs.common.errors import shown
 from star.config import kinds
 from star.config.kinds import Kind, Measure
-from star.config.loading import check_setting, explain, load, parse, read_file, type_of
+from star.config.loading import check_setting, explain, flat, load, parse, read_file, type_of
 from star.config.run import RunConfig
 from star.config.section import ConfigError, Positive
 from star.sweeps.ledger import product
@@ -175,7 +175,9 @@ def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: An
         raise ConfigError(f"{path}: {explain(error.errors()[0], Sweep)}") from None
     folder = path.parent
     base = load(
-        folder / sweep.config, sweep.settings | dict(settings or {}), layers=[folder / layer for layer in sweep.layers]
+        folder / sweep.config,
+        flat(sweep.settings) | dict(settings or {}),
+        layers=[folder / layer for layer in sweep.layers],
     )
     try:
         sweep = sweep.checked(type(base))

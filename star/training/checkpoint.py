@@ -357,6 +357,8 @@ def _kind(about: About) -> Kind:
 
 
 def _reason(error: Exception) -> str:
+    if "Requested shape" in str(error):
+        return "its arrays have other shapes than this agent's, as if the environment had other sizes now"
     return " ".join(str(error).split())[:160]
 
 

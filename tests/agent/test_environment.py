@@ -80,6 +80,45 @@ def test_it_trains_and_resumes_bit_for_bit_where_it_is_trusted(here, monkeypatch
     assert "room:make has no model, which star render needs" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", ["logging:basicConfig", "subprocess:check_output", "room:make"])
+def test_what_a_strangers_run_names_is_not_called_though_python_has_imported_it(here, capsys, name):
+    Path("run").mkdir()
+    victim = {"filename": "victim", "filemode": "w"}
+    Path("run/config.yaml").write_text(json.dumps({**RUN, "env": {"name": name, "options": victim}}))
+    Path("victim").write_text("kept")
+    Path("sweep.yaml").write_text(json.dumps({"config": "run/config.yaml", "parameters": {"trainer.seed": [1, 2]}}))
+    before = sorted(here.rglob("*"))
+    for words in (
+        "train run/config.yaml --run-dir new",
+        "train --resume run",
+        "evaluate run",
+        "render --run run --out new.png",
+        "record run --out new.npz",
+        "report run --out new.html",
+        "sweep sweep.yaml --out new",
+    ):
+        assert main(words.split()) == 2
+        assert "only a file names it, so it is not imported" in capsys.readouterr().err
+    assert Path("victim").read_text() == "kept" and sorted(here.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--import", "tpyo"], "--import: 'tpyo' is no module here; allowed: a name that Python can import"),
+        (["--import", "room.py"], "--import: 'room.py' is no module here"),
+        (
+            ["--env.name", "my-room:make"],
+            "env.name: 'my-room:make' is not allowed: should be module:function, a module",
+        ),
+    ],
+)
+def test_a_name_that_python_cannot_import_is_told_from_one_that_is_not_trusted(here, capsys, words, line):
+    assert main(["train", "run.yaml", "--run-dir", "new", *words]) == 2
+    error = capsys.readouterr().err
+    assert line in error and error.count("\n") == 1 and not Path("new").exists()
+
+
 def config(name, **options):
     return loading.parse({"env": {"name": name, "options": options}})
 
@@ -115,16 +154,32 @@ def test_a_robot_is_drawn(trusted, can_draw):
     assert (trusted / "car.png").stat().st_size > 2000
 
 
+BAD = """def make(goals):
+    raise KeyError('no robot')
+
+number = 3
+nothing = lambda goals: None
+a_class = lambda goals: Exception
+alone = lambda: None
+"""
+
+
 def test_what_cannot_be_had_is_said_in_one_line(trusted):
-    (trusted / "bad.py").write_text("def make(goals):\n    raise KeyError('no robot')\n\nnumber = 3\n")
+    (trusted / "bad.py").write_text(BAD)
     for name, options, line in (
         ("room:make", {"size": 3}, 'env: option "size" is not one of room:make; allowed: goals'),
-        ("room:house", {}, "env: room:house: room holds no house"),
+        ("room:makes", {}, "env: room:makes: room holds no makes (did you mean make?) (" + str(trusted / "room.py")),
+        ("bad:nothing", {}, "env: bad:nothing: gives nothing; allowed: an environment"),
+        ("bad:a_class", {}, "env: bad:a_class: gives the class Exception; allowed: an environment"),
+        ("bad:alone", {}, "env: bad:alone: takes no goals; allowed: def make(goals), which is given train or test"),
+        ("builtins:type", {}, "env: builtins:type: is a type; allowed: a function that makes an environment"),
+        ("car:make", {"episode_length": 40.5}, "env: car:make: car_room: episode_length is 40.5; allowed: a whole"),
+        ("car:make", {"episode_length": "abc"}, "env: car:make: car_room: episode_length is 'abc'; allowed: a whole"),
         ("bad:number", {}, "env: bad:number: is a int; allowed: a function that makes an environment"),
         ("bad:make", {}, "env: bad:make: raises KeyError: 'no robot' (" + str(trusted / "bad.py") + ", line 2)"),
     ):
         with pytest.MonkeyPatch.context() as patch:
-            patch.setenv("STAR_IMPORT", "room,bad")
+            patch.setenv("STAR_IMPORT", "room,car,bad,builtins")
             with pytest.raises(UserError) as error:
                 environment.make(config(name, **options), "train")
         assert str(error.value).startswith(line)

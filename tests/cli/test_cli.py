@@ -67,7 +67,7 @@ def evaluation(run, *, env_steps):
     others = dict.fromkeys(("distance", "return", "seconds_to_goal", "path_length", "stayed"), 7.0) | {"spl": None}
     row = {"episodes": 8} | shares | others | {f"{name}_interval": [0.25, 0.75] for name in shares}
     about = {"run": run, "env": "point_maze", "options": {}, "engine": "jax", "env_steps": env_steps, "goals": "test"}
-    return about | row | {"seeds": [{"seed": 3} | row | {"failed": [2, 5, 6, 7]}]}
+    return about | row | {"film": True, "seeds": [{"seed": 3} | row | {"failed": [2, 5, 6, 7]}]}
 
 
 def test_a_table_names_runs_as_they_are_called(capsys):

@@ -11,7 +11,7 @@ import pytest
 
 from envs.common.errors import UserError
 from star.cli import main
-from star.config import loading
+from star.config import loading, plugins
 from tests.small import EPOCH, RUN, arrays
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto.md"
@@ -91,7 +91,7 @@ def test_what_is_wrong_with_it_is_said_in_one_line_and_nothing_is_written(here, 
 def test_a_module_that_breaks_is_one_line_too(here, capsys):
     (here / "mine.py").write_text("raise OSError('no\\nsuch luck')")
     assert main(["train", "run.yaml", *LEARNER, "--run-dir", "run"]) == 2
-    assert "cannot be imported: OSError: no such luck" in capsys.readouterr().err
+    assert f"cannot be imported: OSError: no ({here / 'mine.py'}, line 1)\n" in capsys.readouterr().err
 
 
 def test_a_file_alone_has_nothing_imported_unless_its_user_said_so(here, monkeypatch):
@@ -104,7 +104,10 @@ def test_a_file_alone_has_nothing_imported_unless_its_user_said_so(here, monkeyp
     assert settings.std == 0.5
     forget(monkeypatch)
     monkeypatch.syspath_prepend(here)
-    __import__("mine")  # by a program of its user's own
+    __import__("mine")  # which tells nothing of who named it
+    with pytest.raises(UserError, match="only a file names it"):
+        loading.parse(named)
+    plugins.trust("mine")  # by a program of its user's own
     assert loading.parse(named, {"controller.own.std": 2}).controller.settings.std == 2
 
 

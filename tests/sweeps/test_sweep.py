@@ -152,6 +152,11 @@ def test_a_grid_tries_every_point_once_and_writes_down_which_is_best(folder, cap
     assert "4 trials by success_final" in out and "next:    star train out/best.yaml" in out
 
 
+def test_settings_in_sections_are_laid_over_those_of_the_config_like_dotted_ones(folder):
+    nested, dotted = ({"trainer": {"eval_episodes": 2}}, {"trainer.eval_episodes": 2})
+    assert plan(written(settings=nested)).base == plan(written(settings=dotted)).base
+
+
 @pytest.mark.parametrize("sampler", ["tpe", "cmaes"])
 def test_samplers_stay_in_the_range_and_draw_no_trial_twice(folder, sampler):
     parameters = {
