@@ -341,7 +341,7 @@ def _distance(achieved: Any, desired: Any) -> Any:
     return ((achieved - desired) ** 2).sum(axis=-1) ** 0.5
 
 
-def _check_number(what: str, number: Any, kind: type, allowed: str) -> None:
+def _check_number(what: str, number: Any, kind: type[Real], allowed: str) -> None:
     if not isinstance(number, kind) or isinstance(number, bool) or not 0 < number < math.inf:
         raise EnvError(f"{what} is {shown(number)}; allowed: {allowed}")
 
