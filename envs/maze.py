@@ -176,8 +176,8 @@ class MazeEnv(Env):
             if word not in words:
                 raise EnvError(f"{name}: {what} is {word!r}; {known(str(word), words)}")
         radius = task.success_radius if success_radius is None else success_radius
-        _check_number(f"{name}: episode_length", episode_length, Integral, "a whole number above 0")
-        _check_number(f"{name}: success_radius", radius, Real, "a number above 0")
+        _check_number(f"{name}: episode_length", episode_length, whole=True)
+        _check_number(f"{name}: success_radius", radius, whole=False)
         return cls(
             name,
             task,
@@ -341,9 +341,10 @@ def _distance(achieved: Any, desired: Any) -> Any:
     return ((achieved - desired) ** 2).sum(axis=-1) ** 0.5
 
 
-def _check_number(what: str, number: Any, kind: type[Real], allowed: str) -> None:
-    if not isinstance(number, kind) or isinstance(number, bool) or not 0 < number < math.inf:
-        raise EnvError(f"{what} is {shown(number)}; allowed: {allowed}")
+def _check_number(what: str, number: Any, *, whole: bool) -> None:
+    kind = isinstance(number, Integral if whole else Real) and not isinstance(number, bool)
+    if not kind or not 0 < float(number) < math.inf:
+        raise EnvError(f"{what} is {shown(number)}; allowed: a {'whole ' * whole}number above 0")
 
 
 def all_finite(data: Any) -> jax.Array:
