@@ -225,6 +225,9 @@ def _indices(values: Any) -> tuple[int, ...]:
 
 def _check_attributes(env: Any, name: str) -> None:
     """Raise `EnvError` if something of a `GoalEnv` is missing or is not what it should be."""
+    if env is None or isinstance(env, type):
+        what = "nothing" if env is None else f"the class {env.__name__}"
+        raise EnvError(f"{name}: gives {what}; allowed: an environment, see envs.GoalEnv")
 
     def refuse(attribute: str, allowed: str) -> NoReturn:
         value = getattr(env, attribute, None)

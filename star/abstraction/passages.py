@@ -145,10 +145,14 @@ def _best(score: Planes, position: Planes) -> Cut:
 
 def _free(abstraction: Abstraction, periods: Outcome, goals: Outcome) -> Bool[Array, "R d parts"]:
     """The parts of each region that are free somewhere: periods began or ended there, or a goal lies there."""
-    points = jnp.concatenate([periods.start, periods.end, (goals.lower + goals.upper) / 2])
-    weight = jnp.concatenate([periods.weight, periods.weight, goals.weight])
-    region = regions.locate(abstraction, points)
-    return _count(abstraction, region, _part(abstraction, region, points), weight) > 0
+
+    def count(points: Float[Array, "N d"], weight: Float[Array, "N"]) -> Float[Array, "R d parts"]:
+        region = regions.locate(abstraction, points)
+        return _count(abstraction, region, _part(abstraction, region, points), weight)
+
+    goal = (goals.lower + goals.upper) / 2
+    visited = count(periods.start, periods.weight) + count(periods.end, periods.weight)
+    return visited + count(goal, goals.weight) > 0
 
 
 def _room(free: Bool[Array, "R d parts"]) -> Int[Array, "R d planes"]:

@@ -171,13 +171,14 @@ def refine(
     indexed by region have to follow, with [pairs_per_epoch * cuts_per_pair] splits and those where nobody passes.
     """
     graph, before, periods = forget(config, graph), abstraction, forward_model.remembered(model)
+    met = reached(goals, cube)
 
     def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
         abstraction, graph = carry
         region, target, found = _most_urgent(config, abstraction, graph, weight)
         inside = region == target
         goal_key, cut_key = jax.random.split(pair_key)
-        commanded, wanted, there = _boxes(abstraction, region, target, goals, cube=cube, key=goal_key)
+        commanded, wanted, there = _boxes(abstraction, region, target, goals, met, cube=cube, key=goal_key)
         judged = found & there
         leaves = _examine(config, abstraction, model, region, commanded, wanted, periods.start, periods.weight)
         verdict = reachability.summary(leaves)
@@ -188,9 +189,8 @@ def refine(
             ),
         )
         mixed = judged & (verdict == MIXED)
-        near = inside | regions.adjacent(abstraction)[region, target]
-        cuttable = mixed & near if config.refinement.neighbours else mixed
-        abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, cuttable, key=cut_key)
+        near = inside | regions.adjacent(abstraction)[region, target] | (not config.refinement.neighbours)
+        abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed & near, key=cut_key)
         verdict = jnp.where(mixed & ~splits.done.any() & reachability.reaches_where_visited(leaves), REACHES, verdict)
         recorded = (verdict == REACHES) | ((verdict == MISSES) & (config.refinement.miss_lifetime > 0))
         settled = judged & ~inside & recorded
@@ -201,7 +201,7 @@ def refine(
     (abstraction, graph), (splits, found, mixed) = jax.lax.scan(
         one_pair, (abstraction, graph), jax.random.split(key, config.refinement.pairs_per_epoch)
     )
-    abstraction, graph, more = _separate(config, abstraction, graph, periods, goals, cube=cube)
+    abstraction, graph, more = _separate(config, abstraction, graph, periods, goals, met)
     splits = jax.tree.map(lambda x, other: jnp.concatenate([x.reshape(-1), other]), splits, more)
     metrics = {
         "examined": found.sum(),
@@ -216,12 +216,10 @@ def refine(
 
 
 def _separate(
-    config: Settings, abstraction: Abstraction, graph: Graph, periods: Outcome, goals: Outcome, *, cube: float | Array
+    config: Settings, abstraction: Abstraction, graph: Graph, periods: Outcome, goals: Outcome, met: Bool[Array, "N"]
 ) -> tuple[Abstraction, Graph, Split]:
     """Cut regions where nobody passes, if that is wanted, those first in which most move on either side."""
-    cuts, evidence = passages.cuts(
-        abstraction, periods, goals, reached(goals, cube), min_width=config.abstraction.min_width
-    )
+    cuts, evidence = passages.cuts(abstraction, periods, goals, met, min_width=config.abstraction.min_width)
     worst = jnp.argsort(-evidence)[: _SEPARATED * config.refinement.separate]
 
     def one(carry: tuple[Abstraction, Graph], chosen: tuple[Cut, Array]) -> tuple[tuple[Abstraction, Graph], Split]:
@@ -282,14 +280,21 @@ def _widening(half: Float[Array, "*n d"], cube: float | Array) -> Float[Array, "
 
 
 def _boxes(
-    abstraction: Abstraction, region: Array, target: Array, goals: Outcome, *, cube: float | Array, key: Array
+    abstraction: Abstraction,
+    region: Array,
+    target: Array,
+    goals: Outcome,
+    met: Bool[Array, "N"],
+    *,
+    cube: float | Array,
+    key: Array,
 ) -> tuple[tuple[Array, Array], tuple[Array, Array], Bool[Array, ""]]:
     """The box that is commanded to examine a pair, the box that is to be reached, and whether there is one.
 
     Both are the target region, or where that is the region itself the box around a goal in it, and the widened one.
     """
     inside = region == target
-    goal, there = _draw_goal(abstraction, region, goals, cube=cube, key=key)
+    goal, there = _draw_goal(abstraction, region, goals, met, key=key)
     commanded = (
         jnp.where(inside, goal[0], abstraction.lower[target]),
         jnp.where(inside, goal[1], abstraction.upper[target]),
@@ -299,12 +304,12 @@ def _boxes(
 
 
 def _draw_goal(
-    abstraction: Abstraction, region: Array, goals: Outcome, *, cube: float | Array, key: Array
+    abstraction: Abstraction, region: Array, goals: Outcome, met: Bool[Array, "N"], *, key: Array
 ) -> tuple[tuple[Array, Array], Bool[Array, ""]]:
     """The box around a random goal inside `region`, one that was reached if possible, and whether there is one."""
     centre = (goals.lower + goals.upper) / 2
     inside = jnp.all((abstraction.lower[region] <= centre) & (centre <= abstraction.upper[region]), axis=-1)
-    chance = inside * goals.weight * (1.0 + reached(goals, cube) + jax.random.uniform(key, goals.weight.shape))
+    chance = inside * goals.weight * (1.0 + met + jax.random.uniform(key, goals.weight.shape))
     drawn = jnp.argmax(chance)
     return (goals.lower[drawn], goals.upper[drawn]), chance[drawn] > 0
 

@@ -73,15 +73,11 @@ def _made(name: str, engine: str, options: dict[str, Any]) -> Any:
             taken = [p.name for p in inspect.signature(factory).parameters.values()]
             raise ConfigError(f'option "{option}" is not one of {name}; {known(option, taken)}')
     try:
-        made = factory(**options)
+        return factory(**options)
     except envs.UserError as error:
         raise ConfigError(f"{name}: {error}") from None
     except Exception as error:  # whatever its author has done
         raise ConfigError(f"{name}: raises {where_raised(error)}") from error
-    if made is None or isinstance(made, type):
-        what = "nothing" if made is None else f"the class {made.__name__}"
-        raise ConfigError(f"{name}: gives {what}; allowed: an environment, see envs.GoalEnv")
-    return made
 
 
 def _takes(factory: Callable[..., Any], option: str) -> bool:

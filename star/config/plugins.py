@@ -80,8 +80,11 @@ def find(name: str, kind: type[Kind]) -> Kind:
 def check_there(module: str) -> None:
     """Raise `UserError` in one line, if there is no such module; it is not imported."""
     _look_here_too()
-    named = NAMED.fullmatch(f"{module}:x") and not module.endswith(".py")
-    if not named or importlib.util.find_spec(module.partition(".")[0]) is None:
+    try:
+        there = importlib.util.find_spec(module.partition(".")[0]) is not None
+    except ValueError:  # no name, or that of a script that runs
+        there = False
+    if not there or not NAMED.fullmatch(f"{module}:x") or module.endswith(".py"):
         raise ConfigError(
             f"--import: {module!r} is no module here; allowed: a name that Python can import, as mine for mine.py"
         )

@@ -107,6 +107,8 @@ def test_what_a_strangers_run_names_is_not_called_though_python_has_imported_it(
     [
         (["--import", "tpyo"], "--import: 'tpyo' is no module here; allowed: a name that Python can import"),
         (["--import", "room.py"], "--import: 'room.py' is no module here"),
+        (["--import", "__main__"], "--import: '__main__' is no module here"),
+        (["--import", ""], "--import: '' is no module here"),
         (
             ["--env.name", "my-room:make"],
             "env.name: 'my-room:make' is not allowed: should be module:function, a module",
