@@ -11,7 +11,8 @@ A share of the environments practises: they pursue random regions instead of the
 unattractive to all others, is tried there.
 
 Greedy episodes explore nothing, remember which commands led back or nowhere, and decide again as soon as a target is
-reached.
+reached. After a command in vain the Tutor draws its subgoals as in training, for what it would choose again is known
+to lead nowhere.
 
 Source: STAR (ICLR 2024), section 4.1.
 """
@@ -226,6 +227,13 @@ def experience(
 def renewed(memory: Memory) -> Bool[Array, "B"]:
     """Where another target follows."""
     return memory.clock == 0
+
+
+def in_vain(memory: Memory, success: Float[Array, "B"]) -> Bool[Array, "B"]:
+    """Where the command before this one did not lead out of the region, in greedy episodes, and not to the goal."""
+    if memory.past is None:
+        return jnp.zeros(len(success), bool)
+    return (memory.past[:, -1, 0] == memory.region) & (memory.past[:, -1, 2] == 0) & (success == 0)
 
 
 def ahead_of_time(section: CommanderConfig, roadmap: Roadmap, memory: Memory, position: Float[Array, "B d"]) -> Memory:

@@ -15,7 +15,7 @@ from star.agent.sections import CommanderConfig
 from star.agent.segments import Segment
 from star.agent.task import Task
 
-__all__ = ["ahead_of_time", "begin", "command", "experience", "init", "observe", "renewed", "settle"]
+__all__ = ["ahead_of_time", "begin", "command", "experience", "in_vain", "init", "observe", "renewed", "settle"]
 
 
 def begin(section: CommanderConfig, position: Float[Array, "B d"], *_: Any, **__: Any) -> Memory:
@@ -55,6 +55,11 @@ def renewed(memory: Memory) -> Bool[Array, "B"]:
 def ahead_of_time(section: CommanderConfig, roadmap: Roadmap, memory: Memory, *_: Any) -> Memory:
     """There is no target to arrive at before the goal."""
     return memory
+
+
+def in_vain(memory: Memory, success: Float[Array, "B"]) -> Bool[Array, "B"]:
+    """Nowhere: there is one command alone."""
+    return jnp.zeros(len(success), bool)
 
 
 def observe(section: CommanderConfig, state: Any, *_: Any, **__: Any) -> Any:

@@ -166,7 +166,8 @@ def segment(
         key=keys[0],
     )
     explore = env_steps is not None
-    choice = agent.tutor.act(config.tutor, task, state.tutor, obs, memory.box, marks, explore=explore, key=keys[1])
+    draw = explore | agent.commander.in_vain(memory, success)
+    choice = agent.tutor.act(config.tutor, task, state.tutor, obs, memory.box, marks, draw=draw, key=keys[1])
     streams = streams.replace(memory=memory, lesson=lesson)
     streams, passed = rollout(agent, env, state, streams, choice, explore=explore, record=record, key=keys[2])
     return streams, passed, marks

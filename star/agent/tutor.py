@@ -90,12 +90,13 @@ def act(
     box: Box,
     marks: Marks,
     *,
-    explore: bool,
+    draw: Bool[Array, "B"],
     key: Array,
 ) -> Choice:
-    """A subgoal for each environment, on the way to its target `box`."""
+    """A subgoal for each environment, on the way to its target `box`: drawn where `draw` says so, else the mean."""
     seen = observe(section, task, obs, box)
-    action = learners.act(section, state, seen, deterministic=not explore, key=key)
+    mean, drawn = (learners.act(section, state, seen, deterministic=one, key=key) for one in (True, False))
+    action = jnp.where(draw[:, None], drawn, mean)
     if section.straight:
         action = jnp.where(stands_close(task, obs, box)[:, None], _straight(task, obs, box.centre), action)
     if marks.way is not None and marks.way.led is not None:

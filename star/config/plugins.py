@@ -80,9 +80,10 @@ def find(name: str, kind: type[Kind]) -> Kind:
 def check_there(module: str) -> None:
     """Raise `UserError` in one line, if there is no such module; it is not imported."""
     _look_here_too()
+    top = module.partition(".")[0]
     try:
-        there = importlib.util.find_spec(module.partition(".")[0]) is not None
-    except ValueError:  # no name, or that of a script that runs
+        there = top != "__main__" and importlib.util.find_spec(top) is not None
+    except ValueError:  # no name
         there = False
     if not there or not NAMED.fullmatch(f"{module}:x") or module.endswith(".py"):
         raise ConfigError(

@@ -325,6 +325,25 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
     assert (0 < early < 7 * B) == arrival
 
 
+def test_the_tutor_draws_subgoals_in_greedy_episodes_where_commands_were_in_vain_and_nowhere_else(
+    breaking_env, tiny, monkeypatch
+):
+    agent = loading.parse(tiny, {"tutor.straight": False}).hyper()
+    spec = replace(Spec.of(breaking_env.env), episode_length=L)
+    odd = jnp.arange(B) % 2 == 1
+
+    def played(in_vain, key):
+        monkeypatch.setattr(commander, "in_vain", lambda memory, success: in_vain)
+        state = levels.init(agent, spec, key=jax.random.key(0))
+        record = lambda env_state, subgoal, box, action: subgoal  # noqa: E731
+        return play.greedy(agent, spec, breaking_env, state, record=record, key=key)[1][0]
+
+    subgoals = [jax.jit(played)(in_vain, jax.random.key(4)) for in_vain in (odd & False, odd, odd | True)]
+    never, where_odd, always = map(np.asarray, subgoals)
+    np.testing.assert_array_equal(where_odd, np.where(odd[:, None], always, never))
+    assert (always != never).all()
+
+
 def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
     agent = loading.parse(tiny).hyper()
     state = jax.jit(lambda key: levels.init(agent, Spec.of(breaking_env.env), key=key))(jax.random.key(0))
@@ -380,13 +399,19 @@ def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(breaking_env, ti
     goal = [slow_locate(state.abstraction, point) for point in np.asarray(seen.goal)]
     left, stayed, changed = np.zeros((B, n, n)), np.zeros((B, n, n)), 0
     before, target = np.asarray(memory.region), np.zeros(B, int)
+    last, vain = [""] * B, 0  # what the last decision came to
     for now, success in zip(route, succeeds, strict=True):
         memory = told(memory, now, jnp.asarray(success, jnp.float32))
+        in_vain = commander.in_vain(memory, jnp.asarray(success, jnp.float32))
         for b in range(B):
             if now[b] != before[b] >= 0:
                 left[b, before[b], target[b]] += 1
+                last[b] = "left"
             elif now[b] == before[b] and not success[b]:
                 stayed[b, now[b], target[b]] += 1
+                last[b] = "stayed"
+            assert in_vain[b] == (last[b] == "stayed" and not success[b])
+            vain += int(in_vain[b])
             values = q[now[b], goal[b], :n]
             luck = np.array([staying(now[b], goal[b], j) for j in range(n)]) ** stayed[b, now[b]]
             known = values * retry ** left[b, now[b]] * luck / (trust * luck + 1 - trust)
@@ -395,4 +420,4 @@ def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(breaking_env, ti
             assert memory.target[b] == best
             changed += best != int(np.argmax(np.where(may, values, -np.inf)))
         before, target = now, np.asarray(memory.target)
-    assert (changed > 20) == (min(retry, trust) < 1)
+    assert (changed > 20) == (min(retry, trust) < 1) and 0 < vain < 25 * B

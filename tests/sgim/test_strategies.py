@@ -574,7 +574,7 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
             nowhere, position = jnp.zeros(n, bool), turning.abstract(obs)
             _, marks = lessons.mark(agent.sgim, lesson, state.abstraction, position, due=nowhere)
         box = streams.memory.box
-        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, box, marks, explore=True, key=key)
+        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, box, marks, draw=jnp.ones(n, bool), key=key)
         _, passed = play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)
         learnt = tutor.experience(agent.tutor, playing.task, passed, marks, renewed=jnp.zeros(n, bool))
         return obs, choice.subgoal, learnt
@@ -638,7 +638,8 @@ def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, 
         streams = play.start(playing, breaking_env, decisions=1, key=key)
         memory, marks, roadmap = commanded_in(playing, state, streams, lesson, key=key)
         obs, section = streams.env.obs, agent.commander
-        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, memory.box, marks, explore=True, key=key)
+        everywhere = jnp.ones(len(obs), bool)
+        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, memory.box, marks, draw=everywhere, key=key)
         streams = streams.replace(memory=memory)
         _, passed = play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)
         ones = jnp.ones_like(passed.alive)

@@ -26,7 +26,7 @@ def test_a_larger_buffer_needs_as_many_more_transitions():
 @pytest.mark.parametrize(
     "overrides",
     [
-        {"controller.learner": "td3", "controller.td3.buffer_size": 2**31 - 1},
+        {"controller.learner": "td3", "controller.td3.buffer_size": 2**31 - 1, "trainer.num_seeds": 1024},
         {"trainer.num_envs": 2**20, "trainer.num_seeds": 1024},
         {"controller.ppo.hidden": [2**14] * 16},
     ],
