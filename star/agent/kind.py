@@ -21,6 +21,15 @@ def _episodes(config: Config) -> int:
     return config.trainer.eval_episodes
 
 
+def _agent(config: Config) -> str:
+    """By the levels that there are."""
+    if config.commander.enabled:
+        return "STAR" if config.tutor.enabled else "GARA"
+    if not config.tutor.enabled:
+        return "flat"
+    return "HRAC" if config.tutor.adjacency.enabled else "HIRO"
+
+
 STAR = Kind(
     Config=Config,
     build=_lazily("experiment", "Star"),
@@ -30,6 +39,7 @@ STAR = Kind(
         Measure("time_at_goal", label="env steps at the goal", where="on test goals"),
     ),
     title=lambda config: config.env.name,
+    agent=_agent,
     unit="env steps",
     tables="regions",
     row={"lower": list, "upper": list, "chosen": list},

@@ -15,7 +15,8 @@ from typing import Any, NoReturn
 
 from envs.common import modes
 from envs.common.errors import Notice, UserError
-from star.cli import envs, evaluate, record, render, report, settings, sweep, train
+from star import __version__
+from star.cli import configs, envs, evaluate, ls, record, render, report, settings, sweep, train
 from star.cli.streams import unbroken
 from star.cli.words import split_settings, value
 from star.config import plugins
@@ -25,10 +26,12 @@ from star.training.signals import at_once, end, leave
 COMMANDS: Mapping[str, ModuleType] = {
     "train": train,
     "sweep": sweep,
+    "ls": ls,
     "evaluate": evaluate,
     "render": render,
     "record": record,
     "report": report,
+    "configs": configs,
     "envs": envs,
     "settings": settings,
 }
@@ -43,12 +46,14 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star train configs/ant_maze.yaml --with configs/agents/hiro.yaml   another agent on the same task
   star train --resume runs/NAME                 go on after an interrupt
   star sweep configs/sweeps/three_values.yaml   try several values and draw what they do
+  star ls                                       the runs so far
   star evaluate runs/NAME                       success on test goals, with 95 % intervals
   star evaluate runs/A runs/B --checkpoint all  every checkpoint of several runs, and how they compare
   star render point_maze --out maze.png         a picture of a task
   star render --run runs/NAME --out film.html   an episode of a trained agent
   star record runs/NAME --out demos.npz         what a trained agent can show another
   star report runs/A runs/B --out report.html   curves, regions and settings of runs, as one page
+  star configs                                  the configs that come with STAR
   star envs                                     the tasks
   star settings [PREFIX]                        every setting, its default and its meaning
 """
@@ -57,6 +62,11 @@ _LONGEST_ERROR = 1000  # characters
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
+        wrong = re.match(r"argument COMMAND: invalid choice: '(.*?)'", message)
+        if wrong:
+            near = difflib.get_close_matches(wrong[1], COMMANDS, n=1)
+            meant = f"did you mean star {near[0]}?" if near else f"allowed: {', '.join(COMMANDS)}"
+            raise ConfigError(f"star: {wrong[1]!r} is no command ({meant})")
         raise ConfigError(f"{self.prog}: {message} (see {self.prog} --help)")
 
 
@@ -150,12 +160,13 @@ def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentPa
     """That of `star`, and those of its commands."""
     shape: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
     parser = _Parser(prog="star", description=_HELP, **shape)
+    parser.add_argument("--version", action="version", version=f"star {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     for name, command in COMMANDS.items():
         one = commands.add_parser(name, help=command.HELP, description=command.DESCRIPTION, **shape)
         command.add(one)
         one.set_defaults(function=command.run)
-        if name != "envs":
+        if name not in ("configs", "envs"):
             one.add_argument(
                 "--import",
                 dest="modules",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from star.cli.words import count, given_back, new_place
 from star.config import kinds, plugins
-from star.config.loading import load, load_run
+from star.config.loading import load, load_run, parse
 from star.config.run import RunConfig
 from star.config.section import ConfigError
 
@@ -50,6 +50,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="be one of several processes: as SLURM or Open MPI started them, or process I of N that meet at HOST:PORT",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress")
+    for sink, where in (("tensorboard", "as TensorBoard's events in the run directory"), ("wandb", "to W&B")):
+        parser.add_argument(
+            f"--{sink}", dest="sinks", action="append_const", const=sink, default=[], help=f"write metrics {where} too"
+        )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="show settings, memory and what would be written; write nothing"
+    )
     parser.add_argument("--experiment", metavar="NAME", help="what learns: star, or MODULE:NAME of your own")
 
 
@@ -65,6 +72,9 @@ def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         config = load_run(options.resume, overrides)
     else:
         config = load(options.config, overrides, layers=options.layers)
+    if options.sinks:
+        sinks = list(dict.fromkeys([*config.trainer.sinks, *options.sinks]))
+        config = parse(config.model_dump(mode="json"), {"trainer.sinks": sinks})
 
     if options.debug:
         from star import debugging
@@ -79,6 +89,11 @@ def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
             raise ConfigError("--distributed: needs --run-dir, the same for all processes")
         devices.join(options.distributed)
     name = "-".join(file.stem for file in (options.config, *options.layers) if file)
+    if options.dry_run:
+        from star.training import dry_run
+
+        print(dry_run.told(config, options.resume or options.run_dir or Path("runs") / f"{name}-<time>"))
+        return 0
     run_dir = options.resume or options.run_dir or new_place(Path("runs"), name)
     with given_back(run_dir):
         result = trainer.train(
@@ -99,6 +114,9 @@ def _say_how_it_ended(result: Result, config: RunConfig) -> None:
     if result.interrupted:
         again = plugins.command("train", "--resume", run_dir)
         print(f"interrupted at {result.env_steps:,} {kind.unit}; go on with: {again}")
+        return
+    if result.env_steps == result.began:
+        print(f"{run_dir}: already at {result.env_steps:,} {kind.unit}; nothing to do")
         return
     measure = kind.measures[0]
     score = "" if result.score is None else f", {measure.name} {result.score:.2f} {measure.where}".rstrip()

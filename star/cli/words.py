@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -16,9 +17,11 @@ from envs.common import files, reading
 from envs.common.errors import UserError
 from star.config.section import ConfigError
 
+_SETTING = re.compile(r"[A-Za-z_]\w*(\.\w+)+=")  # at the beginning of a word; a path would have a /
+
 
 def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
-    """Take the dotted settings `--section.key VALUE` or `--section.key=VALUE` out of `arguments`.
+    """Take the dotted settings `--section.key VALUE`, `--section.key=VALUE` or `section.key=VALUE` out of `arguments`.
 
     Returns the other words, and the settings; raises `UserError` for a setting without a value.
     """
@@ -28,7 +31,7 @@ def split_settings(arguments: Sequence[str]) -> tuple[list[str], dict[str, Any]]
     while waiting:
         word = waiting.pop(0)
         name, equals, text = word.removeprefix("--").partition("=")
-        if not word.startswith("--") or "." not in name:
+        if not (word.startswith("--") and "." in name) and not _SETTING.match(word):
             words.append(word)
             continue
         if not equals:

@@ -81,6 +81,8 @@ class Kind(NamedTuple):
     """What its evaluations measure; checkpoints and sweeps rank by the first."""
     title: Callable[[Any], str] = lambda config: config.experiment
     """What a person calls the experiment of a config."""
+    agent: Callable[[Any], str] = lambda config: ""
+    """What a person calls who learns in it, in a list of runs."""
     unit: str = "iterations"
     """What `env_steps` counts, in words."""
     in_step: bool = False

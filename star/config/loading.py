@@ -16,7 +16,7 @@ from envs.common import reading
 from envs.common.errors import UserError, shown
 from envs.common.files import nearest_file
 from envs.common.plainly import plain
-from star.config import kinds
+from star.config import kinds, shipped
 from star.config.run import RunConfig
 from star.config.section import ConfigError, Section
 
@@ -24,10 +24,17 @@ DEFAULT = "star"
 """The experiment of a config that names none."""
 
 
-def load(path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers: Sequence[str | Path] = ()) -> Any:
+def load(
+    path: str | Path,
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    layers: Sequence[str | Path] = (),
+    typed: str = "command line",
+) -> Any:
     """Read a YAML file, lay others over it, apply dotted overrides such as `{"tutor.period": 5}` and validate.
 
-    The result is a `Config` of the kind that its `experiment` names.
+    Files are paths, or names of those that come with the package, such as `ant_maze` or `agents/hiro`. The result is a
+    `Config` of the kind that its `experiment` names. `typed` says in errors where the overrides come from.
 
     Raises:
       UserError: with one line that names the key, the value and what is allowed.
@@ -35,8 +42,11 @@ def load(path: str | Path, overrides: Mapping[str, Any] | None = None, *, layers
     """
     values: dict[str, Any] = {}
     for file in (path, *layers):
-        values = _merged(values, read_file(Path(file)))
-    return parse(values, overrides, source=" with ".join(map(str, (path, *layers))))
+        read = read_file(shipped.find(Path(file)))
+        if {"config", "parameters"} <= set(read):
+            raise ConfigError(f"{file}: is a sweep file, for star sweep")
+        values = _merged(values, read)
+    return parse(values, overrides, source=" with ".join(map(str, (path, *layers))), typed=typed)
 
 
 def experiment_of(run_dir: Path) -> str:
@@ -86,7 +96,9 @@ def read_file(path: Path) -> dict[str, Any]:
     try:
         values = reading.plain(reading.text(path))
     except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file{nearest_file(path, ('.yaml', '.yml'))}") from None
+        near = [nearest_file(path, (".yaml", ".yml")), shipped.near(path)]
+        meant = next(filter(None, near if path.suffix else reversed(near)), "")
+        raise ConfigError(f"{path}: no such file{meant}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not UTF-8 text'}") from None
     except yaml.YAMLError as error:
@@ -105,11 +117,13 @@ def parse(
     overrides: Mapping[str, Any] | None = None,
     *,
     source: str = "configuration",
+    typed: str = "command line",
     kept: bool = False,
 ) -> Any:
     """Validate nested `values` after applying dotted `overrides`; raises `UserError`. As in `load`.
 
-    What is `kept` by a run or a checkpoint names all settings that there were: one that it does not name is newer.
+    `source` says in errors where the values come from, and `typed` where the overrides do. What is `kept` by a run or a
+    checkpoint names all settings that there were: one that it does not name is newer.
     """
     nested = _with_overrides(plain(values), plain(overrides or {}))
     try:
@@ -122,7 +136,14 @@ def parse(
     try:
         return model.model_validate(nested)
     except ValidationError as error:
-        raise ConfigError(f"{source}: {explain(error.errors()[0], model)}") from None
+        first = error.errors()[0]
+        culprit = typed if _is_among(overrides or {}, first["loc"]) else source
+        raise ConfigError(f"{culprit}: {explain(first, model)}") from None
+
+
+def _is_among(overrides: Mapping[str, Any], place: Sequence[str | int]) -> bool:
+    """Whether what is wrong at this `place` is one of the `overrides`, or a section or a part of one."""
+    return any(all(a == str(b) for a, b in zip(key.split("."), place, strict=False)) for key in overrides if place)
 
 
 def check_setting(config: RunConfig, key: str, value: Any, *, source: str) -> None:

@@ -133,7 +133,7 @@ def _stretches(starts: Sequence[Row], config: RunConfig, *, source: str) -> list
     found: list[Stretch] = []
     for start in starts:
         began = start["env_steps"]
-        used = parse(config.model_dump(mode="json"), start.get("settings"), source=source)
+        used = parse(config.model_dump(mode="json"), start.get("settings"), source=source, typed=source)
         found = [*(stretch for stretch in found if stretch[0] < began), (began, used)]
     return [(began, used) for began, used in found if began < used.trainer.total_env_steps] or [(0, config)]
 

@@ -13,7 +13,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from envs.common.errors import shown
-from star.config import kinds
+from star.config import kinds, shipped
 from star.config.kinds import Kind, Measure
 from star.config.loading import check_setting, explain, flat, load, parse, read_file, type_of
 from star.config.run import RunConfig
@@ -153,7 +153,7 @@ class Plan:
 
     def config(self, parameters: Mapping[str, Any]) -> Any:
         """That of a trial; raises `UserError` if these values do not go together."""
-        return parse(self.base.model_dump(mode="json"), self.values(parameters), source="trial")
+        return parse(self.base.model_dump(mode="json"), self.values(parameters), source="trial", typed="trial")
 
     def values(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
         """Settings from what Optuna calls the parameters of a trial."""
@@ -165,20 +165,26 @@ class Plan:
 
 
 def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: Any) -> Plan:
-    """Read and check a sweep file; raises `UserError`.
+    """Read and check a sweep file, a path or the name of one that comes with the package; raises `UserError`.
 
     `settings` are laid over those of all trials, and `changes`, such as `trials=8`, over the file's own fields.
     """
+    path = shipped.find(path)
+    values = read_file(path)
+    if values and not {"config", "parameters"} & set(values):
+        raise ConfigError(f"{path}: is no sweep file, which has config: and parameters:; a config is for star train")
     try:
-        sweep = Sweep.model_validate(read_file(path) | changes)
+        sweep = Sweep.model_validate(values | changes)
     except ValidationError as error:
         raise ConfigError(f"{path}: {explain(error.errors()[0], Sweep)}") from None
     folder = path.parent
     base = load(
-        folder / sweep.config,
-        flat(sweep.settings) | dict(settings or {}),
-        layers=[folder / layer for layer in sweep.layers],
+        shipped.find(sweep.config, beside=folder),
+        flat(sweep.settings),
+        layers=[shipped.find(layer, beside=folder) for layer in sweep.layers],
+        typed=f"{path}: settings",
     )
+    base = parse(base.model_dump(mode="json"), settings, source=str(path))
     try:
         sweep = sweep.checked(type(base))
     except ValueError as error:
@@ -192,7 +198,7 @@ def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: An
         for value in parameter.ends:
             check_setting(base, key, value, source=f"{path}: parameters")
             if key.startswith("env."):
-                programs.build(parse(base.model_dump(mode="json"), {key: value}, source=f"{path}: parameters"))
+                programs.build(parse(base.model_dump(mode="json"), {key: value}, typed=f"{path}: parameters"))
     program = programs.build(base)
     evaluations = -(-program.epochs // base.trainer.eval_every)
     distributions = {

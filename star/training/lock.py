@@ -15,6 +15,18 @@ from star.config.section import ConfigError
 NAME = ".lock"
 
 
+def held(run_dir: Path) -> bool:
+    """Whether a process writes into `run_dir`, as far as the file system can tell."""
+    try:
+        with (run_dir / NAME).open(encoding="utf-8") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
 @contextlib.contextmanager
 def locked(run_dir: Path, *, warn: Callable[[str], None]) -> Iterator[None]:
     """Hold `run_dir` alone; raises `UserError` if another process does, or if the folder cannot be written.

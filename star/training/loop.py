@@ -44,6 +44,8 @@ class Result:
     """What was not finite, if that is why."""
     saved: int | None = None
     """Env steps of the last checkpoint."""
+    began: int = 0
+    """Env steps that there were before."""
 
 
 class Loop:
@@ -63,7 +65,7 @@ class Loop:
         profile: tuple[int, int],
     ) -> None:
         self._program, self._recorder, self._checkpoints, self._run_dir = program, recorder, checkpoints, run_dir
-        self._done = done
+        self._began = self._done = done
         self._saved = done if checkpoints.steps() else -1
         self._spare: tuple[int, Any] | None = None
         """(epochs, state) before what may take long."""
@@ -78,7 +80,7 @@ class Loop:
             experiment=program.experiment,
             kind=program.kind,
             title=_title(program),
-            total=program.epochs * program.steps_per_epoch,
+            total=max(program.epochs, done) * program.steps_per_epoch,
             done=self._env_steps,
             quiet=quiet,
         )
@@ -89,6 +91,7 @@ class Loop:
     def run(self, state: Any) -> Result:
         """Train from `state` to the end, to a signal, or until numbers are no longer finite."""
         program, muted = self._program, not devices.first()
+        self._say_what_is_rounded()
         history = self._recorder.journal.metrics.read() if program.config.trainer.sinks else []
         self._stop.on_first = self._display.stop
         try:
@@ -112,7 +115,14 @@ class Loop:
             terminated=interrupted and devices.anywhere(self._stop.terminated),
             fault=fault,
             saved=steps[-1] if steps else None,
+            began=self._began * program.steps_per_epoch,
         )
+
+    def _say_what_is_rounded(self) -> None:
+        wanted, one = self._program.config.trainer.total_env_steps, self._program.steps_per_epoch
+        total = self._program.epochs * one
+        if self._began < self._program.epochs and wanted != total:
+            self._display.note(f"trainer.total_env_steps: {wanted:,} becomes {total:,}, whole epochs of {one:,}")
 
     def _epochs(self, state: Any, others: Sinks) -> tuple[Any, Fault | None]:
         program, fault = self._program, None

@@ -95,6 +95,17 @@ def refusal(capsys, folder, arguments):
     ("arguments", "said"),
     [
         pytest.param("train point.yaml --commander.perod 5", "commander.period?", id="misspelt key"),
+        pytest.param("trian point.yaml", "star: 'trian' is no command (did you mean star train?)", id="command"),
+        pytest.param("practise point.yaml", "'practise' is no command (allowed: train, sweep, ", id="no command"),
+        pytest.param("train point.yaml tutor.perod=5", "command line: tutor.perod: unknown key", id="misspelt word"),
+        pytest.param("train point.yaml tutor.period=x", "command line: tutor.period: 'x' is not", id="value of a word"),
+        pytest.param("train pointmaze", "pointmaze: no such file (did you mean point_maze?)", id="name of a config"),
+        pytest.param("train point.yaml --with agents/hiros", "(did you mean agents/hiro?)", id="name of a layer"),
+        pytest.param("train sweeps/point_maze", "is a sweep file, for star sweep", id="sweep as a config"),
+        pytest.param("sweep point_maze", "point_maze.yaml: is no sweep file", id="config as a sweep"),
+        pytest.param("configs arm", "arm: no config has this in its name", id="no such configs"),
+        pytest.param("ls nowhere", "nowhere: cannot be read: No such file", id="runs of no folder"),
+        pytest.param("train point.yaml --dry-run --tutor.period 7", "not a multiple", id="dry run of what is refused"),
         pytest.param("train point.yaml --with no.yaml", "no.yaml: no such file", id="missing layer"),
         pytest.param(
             "train --resume run --with point.yaml", "--with: a resumed run keeps", id="layer on a resumed run"
@@ -175,7 +186,6 @@ def refusal(capsys, folder, arguments):
         pytest.param("settings tutr", "tutr: no setting begins so", id="unknown prefix"),
         pytest.param("settings --tutor.period=5", "takes no settings", id="settings with a setting"),
         pytest.param("envs --tutor.period 5", "takes no settings", id="envs with a setting"),
-        pytest.param("trian point.yaml", "invalid choice: 'trian'", id="unknown command"),
     ],
 )
 def test_bad_input_is_one_line_and_nothing_is_written(capsys, folder, arguments, said):
