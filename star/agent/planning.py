@@ -9,9 +9,10 @@ Commanding the goal's own region is another thing, for the Tutor is then given t
 and believed to be as where the goal is elsewhere.
 The probabilities of i' sum to less than 1 where episodes were lost (terminated). What was not tried is believed to
 succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
-region gets there. `prior` decisions weigh as much as this belief. Where regions were cut, the epoch's decisions are
-counted anew by today's regions, and older ones are shared out by where periods began and ended (`follow`). Greedy
-episodes, in which nothing is learnt, follow a plan with hardly any belief (`settle`).
+region gets there. This belief weighs `prior` decisions, and e^(-n / prior) of that after n decisions. Where regions
+were cut, the epoch's decisions are counted anew by today's regions, and older ones are shared out by where periods
+began and ended (`follow`). Greedy episodes, in which nothing is learnt, follow a plan with hardly any belief
+(`settle`).
 
 Those who practise pursue a region by the same plan with another reward, 1 in the region pursued.
 
@@ -202,12 +203,24 @@ def _expectations(
     identity = jnp.eye(believed.shape[0])
     there, here = identity[None], identity[:, None]
     expected = jnp.where(believed[..., None], belief * there + (1 - belief) * here, here)
-    counted = (model.led.sum(axis=-1) + model.lost + section.prior)[..., None]
-    to_region = (model.led[0] + section.prior * expected) / counted[0]
-    to_goal = (model.led[1] + section.prior * to_region) / counted[1]
+    number = model.led.sum(axis=-1) + model.lost
+    weight = _weight_of_belief(section, number)[..., None]
+    counted = number[..., None] + weight
+    to_region = (model.led[0] + weight[0] * expected) / counted[0]
+    to_goal = (model.led[1] + weight[1] * to_region) / counted[1]
     chances = jnp.stack([to_region, to_goal])
     arrived = (section.reward == "success") * belief * identity[:, :, None] * identity[:, None]
-    return chances, (model.rewards + section.prior * arrived) / (model.visits + section.prior)
+    weight = _weight_of_belief(section, model.visits)
+    return chances, (model.rewards + weight * arrived) / (model.visits + weight)
+
+
+def _weight_of_belief(section: CommanderConfig, number: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """What belief in a command weighs, in decisions, after a `number` of them.
+
+    It fades faster than its share in a mean would. Who may try again and again needs no more than a small chance to
+    find the way through a wall better than the long one around it.
+    """
+    return section.prior * jnp.exp(-number / section.prior)
 
 
 def _iterated(

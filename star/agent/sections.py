@@ -60,7 +60,11 @@ class CommanderConfig(Section):
         description="of a decision: mean success of its k env steps, or mean or maximum of r_ext",
     )
     sweeps: Repeats = Field(10, description="sweeps of value iteration of learner model after every k env steps")
-    prior: float = Field(5.0, gt=0, description="decisions that weigh as much as the belief in what was not tried")
+    prior: float = Field(
+        5.0,
+        gt=0,
+        description="decisions that weigh as much as the belief in what was not tried; it fades as it is tried",
+    )
     memory: float = Field(
         0.5, ge=0, le=1, description="share of old decisions left in the model an epoch later; 20 of each command stay"
     )

@@ -1,5 +1,6 @@
 """Q-learning and planning over regions, against loops over decisions and cells."""
 
+import math
 from functools import partial
 
 import jax
@@ -165,6 +166,10 @@ def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
         if not (batch.practised[n] and j == g):
             reward[i, g, j] += max(batch.weight[n], batch.lost[n]) * batch.reward[n]
             visits[i, g, j] += max(batch.weight[n], batch.lost[n])
+
+    def weight(number):
+        return prior * math.exp(-number / prior)
+
     for _ in range(sweeps):
         value, chance = np.zeros((2, R + 1, R))
         for i in range(R):
@@ -173,16 +178,17 @@ def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
                 chance[i, g] = max(reach[i, g, j] for j in range(R) if allowed[i, j])
         for i in range(R):
             for j in range(R):
-                chances = to_region[i, j].copy()
-                chances[j] += prior * belief * believed[i, j]
-                chances[i] += prior * (1 - belief * believed[i, j])
+                chances, believing = to_region[i, j].copy(), weight(to_region[i, j].sum())
+                chances[j] += believing * belief * believed[i, j]
+                chances[i] += believing * (1 - belief * believed[i, j])
                 chances /= chances.sum()
-                at_goal = to_goal[i, j] + prior * chances
+                at_goal = to_goal[i, j] + weight(to_goal[i, j].sum()) * chances
                 at_goal /= at_goal.sum()
                 for g in range(R):
-                    r = reward[i, g, j] + prior * belief * (i == g == j)
+                    succeeding = weight(visits[i, g, j])
+                    r = reward[i, g, j] + succeeding * belief * (i == g == j)
                     later = (at_goal if j == g else chances) @ value[:, g]
-                    q[i, g, j] = r / (visits[i, g, j] + prior) + discount * later
+                    q[i, g, j] = r / (visits[i, g, j] + succeeding) + discount * later
                     reach[i, g, j] = (i == g) + discount * chances @ chance[:, g]
     return q, reach, visits
 
@@ -208,7 +214,7 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
         np.testing.assert_array_equal(settled.model.reach, before.model.reach)
 
 
-def corridor(batch_of, *, shortcut=False, greedy=False):
+def corridor(batch_of, *, shortcut=False, greedy=False, periods=10):
     """Plans in regions 0-1-2-3 in a row, of which each believes to reach its neighbours, and 3 by the `shortcut`."""
     chosen = settings(learner="model", reward="success", discount=0.9, prior=1.0, sweeps=60)
     neighbours = np.abs(np.subtract.outer(np.arange(R), np.arange(R))) == 1
@@ -219,7 +225,7 @@ def corridor(batch_of, *, shortcut=False, greedy=False):
         state = counted(chosen, state, batch)
     roadmap = known(everything, jnp.array(neighbours))
     if greedy:
-        return settle(chosen, state, roadmap, periods=10).q
+        return settle(chosen, state, roadmap, periods=periods).q
     return plan(chosen, state, roadmap).q
 
 
@@ -278,6 +284,16 @@ def test_what_aiming_at_the_goal_does_tells_nothing_of_aiming_at_its_region():
         assert at_goal[1, 2, 2] > through[1, 2, 2]
 
 
+@pytest.mark.parametrize("greedy", [False, True])
+def test_a_wall_that_was_run_against_twenty_times_is_no_way_however_long_the_other_one(greedy):
+    tried = [many(0, 3, 0, count=20)]
+    for i in range(3):  # one of twenty periods leads on
+        tried += [many(i, i + 1, i, count=19), many(i, i + 1, i + 1, count=1)]
+    q = corridor(tried, shortcut=True, greedy=greedy, periods=60)
+    assert 0 < q[0, 3, 3] < 0.91 * q[0, 3, 1]  # to run against it once more costs a period, discounted by .9
+    assert corridor(tried[1:], shortcut=True, greedy=greedy, periods=60)[0, 3].argmax() == 3  # who has not yet tried
+
+
 def test_where_the_goals_region_is_cut_nobody_aims_beside_the_goal():
     """Region 2, which was only aimed at for the goal in it, is cut in two, and the goal is in the new half, 3."""
     chosen = settings(learner="model", reward="success", discount=0.9, prior=1.0)
@@ -293,7 +309,7 @@ def test_where_the_goals_region_is_cut_nobody_aims_beside_the_goal():
 
 
 def test_a_command_that_ends_the_episode_is_worth_less_than_one_that_fails():
-    stays, dies = corridor([many(1, 2, 1)]), corridor([many(1, 2, 1, lost=1.0)])
+    stays, dies = corridor([many(1, 2, 1, count=3)]), corridor([many(1, 2, 1, count=3, lost=1.0)])
     assert dies[1, 3, 2] < stays[1, 3, 2]
 
 
