@@ -11,7 +11,7 @@ import numpy as np
 
 from star.config.kinds import Arrays, Migration
 
-FORMAT = 4  # since aiming at a goal is counted apart from aiming at its region
+FORMAT = 5  # since PPO's critics speak of returns in running units
 
 
 def _count_for_both_aims(arrays: Arrays) -> Arrays:
@@ -20,7 +20,22 @@ def _count_for_both_aims(arrays: Arrays) -> Arrays:
     return {name: np.stack([x, x], axis=1) if name in counts else x for name, x in arrays.items()}
 
 
+def _returns_as_they_are(arrays: Arrays) -> Arrays:
+    """PPO's critics spoke of returns as they are: mean 0, deviation 1."""
+    new: Arrays = {}
+    for name, x in arrays.items():
+        level, learnt, _ = name.partition("/params/log_std")
+        if learnt:
+            seeds = len(x)
+            new |= {
+                f"{level}/returns/mean": np.zeros(seeds, x.dtype),
+                f"{level}/returns/variance": np.ones(seeds, x.dtype),
+            }
+    return arrays | new
+
+
 TO_NEXT: Mapping[int, Migration] = {
     2: Migration(),  # the same, in other files and without checksums
     3: Migration(arrays=_count_for_both_aims),
+    4: Migration(arrays=_returns_as_they_are),
 }

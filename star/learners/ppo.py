@@ -3,11 +3,14 @@
     for each of `passes`:                        # over one rollout [T, B], shuffled into minibatches
         ratio  = pi(a|o) / pi_old(a|o)
         actor  = -E[min(ratio A, clip(ratio) A)] - entropy H(pi)
-        critic = E[(V(o) - R)^2] / 2
+        critic = E[(v(o) - (R - mean) / deviation)^2] / 2
         the step size grows or shrinks to keep KL(pi_old, pi) near `target_kl`
 
 A and R come from generalised advantage estimation (Schulman et al. 2016); time limits and changes of goal are
 cut, never treated as the end of the task.
+
+The scale of rewards does not matter: V(o) = mean + deviation v(o), with running statistics of R (as in PopArt, van
+Hasselt et al. 2016, but for its exact correction of v), and the gradients of actor and critic are clipped apart.
 """
 
 from __future__ import annotations
@@ -26,10 +29,47 @@ from jaxtyping import Array, Float
 from star import devices
 from star.learners.networks import MLP, Normalizer, apply
 from star.learners.protocol import Learner
-from star.learners.replay import Imitation, Penalty, Transition, flatten
+from star.learners.replay import Imitation, Penalty, Transition, flatten, weighted_mean
 from star.learners.sections import PPOConfig
 
 Metrics = dict[str, Array]
+
+_RATE = 0.05  # of a rollout in the running statistics of returns
+_LEAST = 1e-6  # deviation of returns
+
+
+class Returns(struct.PyTreeNode):
+    """Mean and variance of the returns of late, the units of the critic; variance 0: none were seen."""
+
+    mean: Float[Array, ""]
+    variance: Float[Array, ""]
+
+    @property
+    def deviation(self) -> Float[Array, ""]:
+        """Not below what keeps numbers finite."""
+        return jnp.maximum(jnp.sqrt(self.variance), _LEAST)
+
+    def normalized(self, returned: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """What the critic says of these returns."""
+        return (returned - self.mean) / self.deviation
+
+    def restored(self, said: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """The returns that the critic speaks of."""
+        return self.mean + self.deviation * said
+
+    def started(self, config: PPOConfig, rollout: Transition) -> Returns:
+        """Before the first rollout a guess by its rewards, as if they were independent of one another."""
+        power = weighted_mean(jnp.square(rollout.reward), rollout.weight)
+        guess = power / jnp.maximum(1 - jnp.square(config.discount), 1 / len(rollout.reward))
+        return self.replace(variance=jnp.where(self.variance > 0, self.variance, guess))
+
+    def updated(self, returned: Float[Array, "*n"], weight: Float[Array, "*n"], *, rate: Array) -> Returns:
+        """With those of a rollout, of which samples of weight 0 do not count."""
+        mean = weighted_mean(returned, weight)
+        variance = weighted_mean(jnp.square(returned - mean), weight)
+        return Returns(
+            mean=self.mean + rate * (mean - self.mean), variance=self.variance + rate * (variance - self.variance)
+        )
 
 
 class PPOState(struct.PyTreeNode):
@@ -38,6 +78,7 @@ class PPOState(struct.PyTreeNode):
     params: Mapping[str, Any]
     optimizer: optax.OptState
     normalizer: Normalizer
+    returns: Returns
     learning_rate: Float[Array, ""]
 
 
@@ -60,7 +101,19 @@ def _critic(config: PPOConfig) -> MLP:
 
 
 def _optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
+    return optax.chain(_clip_apart(config.max_grad_norm), optax.scale_by_adam(eps=1e-5))
+
+
+def _clip_apart(norm: float | Array) -> optax.GradientTransformation:
+    """The norm of the critic's gradient is clipped, and that of the policy's."""
+    clip = optax.clip_by_global_norm(norm)
+
+    def update(gradient: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        critic = {"critic": gradient["critic"]}
+        policy = {name: part for name, part in gradient.items() if name not in critic}
+        return clip.update(policy, state)[0] | clip.update(critic, state)[0], state
+
+    return optax.GradientTransformation(clip.init, update)
 
 
 def init(key: Array, config: PPOConfig, *, example: Transition) -> PPOState:
@@ -76,6 +129,7 @@ def init(key: Array, config: PPOConfig, *, example: Transition) -> PPOState:
         params=params,
         optimizer=_optimizer(config).init(params),
         normalizer=Normalizer.create(obs_size),
+        returns=Returns(mean=jnp.zeros(()), variance=jnp.zeros(())),
         learning_rate=jnp.asarray(config.learning_rate, jnp.float32),
     )
 
@@ -102,7 +156,7 @@ def update(
     `penalty(batch, action)` [N] is added to the loss of the actor whose mean is `action`, and so is that of
     `imitation`.
     """
-    samples = _prepare(config, state, rollout, keep=penalty is not None)
+    samples, returns = _prepare(config, state, rollout, keep=penalty is not None)
     if imitation is not None:
         imitation = imitation.replace(obs=state.normalizer(imitation.obs))
 
@@ -122,6 +176,7 @@ def update(
         params=params,
         optimizer=optimizer,
         normalizer=state.normalizer.update(rollout.obs, rollout.weight),
+        returns=returns,
         learning_rate=learning_rate,
     )
     metrics = jax.tree.map(jnp.mean, metrics) | {
@@ -159,14 +214,17 @@ def _log_prob(mean: Array, std: Array, action: Array) -> Array:
     return jnp.sum(-0.5 * jnp.square((action - mean) / std) - jnp.log(std), axis=-1)
 
 
-def _prepare(config: PPOConfig, state: PPOState, rollout: Transition, *, keep: bool) -> _Sample:
-    """The rollout as independent samples [T * B], seen through the networks that collected it.
+def _prepare(config: PPOConfig, state: PPOState, rollout: Transition, *, keep: bool) -> tuple[_Sample, Returns]:
+    """The rollout as independent samples [T * B], seen through the networks that collected it, and returns with it.
 
     With `keep` the samples hold their transition too. Every device gets them all, to draw its shares of minibatches.
     """
     obs, next_obs = state.normalizer(rollout.obs), state.normalizer(rollout.next_obs)
-    values = _value(config, state.params, obs)
-    advantage = advantages(config, rollout, values, _value(config, state.params, next_obs))
+    known = state.returns.started(config, rollout)
+    values, next_values = (known.restored(_value(config, state.params, seen)) for seen in (obs, next_obs))
+    advantage = advantages(config, rollout, values, next_values)
+    rate = jnp.where(state.returns.variance > 0, _RATE, 1.0)
+    returns = known.updated(advantage + values, rollout.weight, rate=rate)
     mean, std = _policy(config, state.params, obs)
     sample = _Sample(
         transition=rollout if keep else None,
@@ -174,10 +232,10 @@ def _prepare(config: PPOConfig, state: PPOState, rollout: Transition, *, keep: b
         action=rollout.action,
         log_prob=_log_prob(mean, std, rollout.action),
         advantage=advantage,
-        target=advantage + values,
+        target=returns.normalized(advantage + values),
         weight=rollout.weight,
     )
-    return flatten(devices.whole(sample))
+    return flatten(devices.whole(sample)), returns
 
 
 def _minibatches(samples: _Sample, count: int, *, key: Array) -> _Sample:

@@ -30,7 +30,7 @@ class PPOConfig(LearnerConfig):
     minibatches: Positive = Field(8, description="minibatches per pass")
     initial_std: float = Field(0.8, gt=0, description="initial standard deviation of actions in [-1, 1]")
     min_std: float = Field(0.05, gt=0, description="floor of the standard deviation")
-    max_grad_norm: float = Field(1.0, gt=0, description="global gradient norm is clipped to this")
+    max_grad_norm: float = Field(1.0, gt=0, description="gradient norms of actor and critic are clipped to this")
 
     def check(self, rollout: Rollout) -> None:
         """Minibatches are equal shares of a rollout, and are cut into equal shares for devices."""

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from star.config import loading
@@ -172,3 +173,58 @@ def test_a_price_on_the_mean_action_pulls_it_away(start):
         state = update(state, jax.random.key(i))
     mean = lambda s: ppo.act(settings(), s, rollout.obs, deterministic=True, key=jax.random.key(0)).mean()  # noqa: E731
     assert float(mean(state)) > float(mean(start)) + 0.1
+
+
+@pytest.mark.parametrize("power", [-7, 7])
+def test_the_scale_of_rewards_does_not_matter(start, update, power):
+    """By a power of two, so that rounding is the same."""
+    scale, one, other = 2.0**power, start, start
+    act = jax.jit(lambda state, obs, key: ppo.act(settings(), state, obs, key=key))
+    for seed in range(10):
+        rollout, key = random_rollout(seed), jax.random.key(seed)
+        rollout = rollout.replace(action=act(one, rollout.obs, key), weight=np.float32(rollout.obs[..., 0] < 1))
+        one, expected = update(settings(), one, rollout, key)
+        other, got = update(settings(), other, rollout.replace(reward=scale * rollout.reward), key)
+        for name, value in expected.items():
+            np.testing.assert_allclose(got[name], value, rtol=1e-4, atol=1e-4)
+        actions = [act(state, rollout.obs, key) for state in (one, other)]
+        np.testing.assert_allclose(*actions, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(other.returns.deviation, scale * one.returns.deviation, rtol=1e-4)
+    assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (one.params, start.params)), strict=True))
+
+
+def test_a_critic_whose_gradient_is_huge_does_not_slow_the_actor_down(start, update):
+    """Values of a state that do not fit at all, and a policy that learns the same."""
+    rollout = random_rollout()
+    far = jax.tree.map(lambda x: 1e3 * x, start.params["critic"])
+    lost = start.replace(params=start.params | {"critic": far})
+    once = settings(passes=1, minibatches=1, gae_lambda=1.0)
+    alone = rollout.replace(terminated=np.ones((T, B), np.float32))  # advantages are rewards minus values
+    (with_far, far_told), (usual, told) = (update(once, state, alone, jax.random.key(0)) for state in (lost, start))
+    assert far_told["critic_loss"] > 100 * told["critic_loss"]
+
+    def moved(state):
+        return optax.tree.norm(jax.tree.map(jnp.subtract, state.params["actor"], start.params["actor"]))
+
+    assert moved(with_far) > 0.5 * moved(usual)
+
+
+def test_the_critic_comes_to_know_returns_that_are_large_and_much_alike():
+    """Returns of 1,000 and 1,001 in two kinds of states."""
+    chosen = settings(learning_rate=3e-3, max_learning_rate=3e-3, discount=0.0, passes=4)
+    example = EXAMPLE.replace(obs=jnp.zeros(1), next_obs=jnp.zeros(1), action=jnp.zeros(1))
+    obs = jnp.where(jnp.arange(64) % 2, 1.0, -1.0)[None, :, None]
+    one, zero = jnp.ones((1, 64)), jnp.zeros((1, 64, 1))
+    rollout = Transition(
+        obs=obs, action=zero, reward=1000.5 + 0.5 * obs[..., 0], next_obs=obs, terminated=one, cut=one, weight=one
+    )
+
+    @jax.jit
+    def learn(key):
+        state = ppo.init(key, chosen, example=example)
+        once = lambda state, key: ppo.update(chosen, state, rollout, key=key)  # noqa: E731
+        return jax.lax.scan(once, state, jax.random.split(key, 60))
+
+    state, metrics = learn(jax.random.key(0))
+    assert metrics["critic_loss"][-1] < 0.01  # half the square of the error, in deviations
+    np.testing.assert_allclose([state.returns.mean, state.returns.deviation], [1000.5, 0.5], rtol=1e-3)

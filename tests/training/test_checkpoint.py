@@ -296,6 +296,19 @@ def test_what_is_read_of_an_older_format_is_what_was_written(name, tmp_path):
     checkpoints.close()
 
 
+def test_the_critics_of_format_4_speak_of_returns_as_they_are(tmp_path):
+    checkpoints = Checkpoints(unpacked("format_4", tmp_path))
+    before = checkpoints.arrays(480)
+    after = STAR.migrated_arrays(before, 4)
+    new = {
+        f"{level}/returns/{name}": x for level in ("tutor", "controller") for name, x in (("mean", 0), ("variance", 1))
+    }
+    assert set(after) - set(before) == set(new) and set(before) <= set(after)
+    for name, x in new.items():
+        np.testing.assert_array_equal(after[name], [x, x])
+    checkpoints.close()
+
+
 def test_a_checkpoint_of_format_2_whose_config_is_damaged_is_refused(tmp_path):
     run_dir = unpacked("format_2", tmp_path)
     checkpoints = Checkpoints(run_dir)

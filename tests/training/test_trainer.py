@@ -288,7 +288,7 @@ def test_a_disk_that_fills_up_ends_the_run_in_one_line_and_it_resumes(finished, 
     assert_same_end(part, run_dir)
 
 
-@pytest.mark.parametrize("name", ["format_2", "format_3"])
+@pytest.mark.parametrize("name", ["format_2", "format_3", "format_4"])
 def test_a_run_of_an_older_format_goes_on_from_its_checkpoint(name, tmp_path, capsys):
     run_dir = unpacked(name, tmp_path)
     before = rows(run_dir)
