@@ -60,7 +60,7 @@ def table(entries: Sequence[Entry]) -> Table:
     shown.add_column("state")
     for one in entries:
         score = "" if one.score is None else f"{one.measure} {one.score:.2f}"
-        steps = f"{_count(one.steps)} of {_count(one.total)}" if one.total else ""
+        steps = _count(one.steps) + (f" of {_count(one.total)}" if one.steps < one.total else "")
         seeds = str(one.seeds) if one.seeds else ""
         shown.add_row(*map(Text, (one.path.name, one.task, one.agent, seeds, score, steps, _age(one.age_s), one.state)))
     return shown

@@ -101,8 +101,9 @@ def test_runs_are_listed_with_what_they_came_to(capsys):
     with (run_folder("busy", steps=[240]) / ".lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         lines = listed(capsys)
-    assert "point_maze  STAR" in lines["whole"] and "success_final 0.25  1 k of 1 k" in lines["whole"]
-    assert "HIRO" in lines["cut"] and "success_final 0.25" in lines["cut"]
+    assert "point_maze  STAR" in lines["whole"] and "success_final 0.25" in lines["whole"]
+    assert " of " not in lines["whole"]
+    assert "HIRO" in lines["cut"] and "success_final 0.25  1 k of 1 k" in lines["cut"]
     assert "success" not in lines["new"] + lines["faulty"]
     ends = {"whole": "done", "cut": "stopped", "new": "stopped", "faulty": "not finite", "busy": "training"}
     for name, state in (ends | {"broken": "cannot be read", "odd": "cannot be read"}).items():
@@ -117,7 +118,7 @@ def test_only_the_end_of_a_long_file_is_read(capsys, monkeypatch):
     monkeypatch.setattr(listing, "_TAIL", 300)
     run_folder("long", steps=range(240, 10 * 240, 240))
     line = listed(capsys)["long"]
-    assert "2 k of 1 k" in line
+    assert "2 k " in line
 
 
 def test_what_whole_epochs_make_of_the_env_steps_is_said_and_that_nothing_is_left_to_do(folder, capsys):
