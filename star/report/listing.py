@@ -109,7 +109,7 @@ def _last(path: Path) -> list[Mapping[str, Any]]:
         rows = [json.loads(line) for line in lines]
     except FileNotFoundError:
         return []
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         raise ConfigError(f"{path}: cannot be read") from None
     if not all(isinstance(row, dict) and isinstance(row.get("env_steps"), int) for row in rows):
         raise ConfigError(f"{path}: is not what a run writes")

@@ -4,31 +4,25 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from star.config import kinds
 from star.config.run import RunConfig
-from star.training import memory_budget, run_folder, sinks
-from star.training import program as programs
+from star.training import memory_budget, trainer
 
 
 def told(config: RunConfig, run_dir: Path) -> str:
     """The resolved settings as YAML, and before them, as comments, what they lead to; raises `UserError` like a run."""
-    run_folder.check_name(run_dir)
-    sinks.check(config)
-    program = programs.build(config)
-    program.data()
-    memory_budget.check(program)
+    program = trainer.ready(config, run_dir)
     needed = memory_budget.needed(program)
-    total, unit = program.epochs * program.steps_per_epoch, kinds.of(config).unit
-    trainer = program.config.trainer
+    total, unit = program.epochs * program.steps_per_epoch, program.kind.unit
+    section = program.config.trainer
     seeds = f"{len(program.seeds)} seeds side by side" if len(program.seeds) > 1 else f"seed {program.seeds[0]}"
     parts = ", ".join(f"{name} {_mib(count)}" for name, count in sorted(needed.items(), key=lambda one: -one[1])[:3])
     lines = [
         "dry run: nothing was written",
         f"would write to  {run_dir}: config.yaml, metrics, checkpoints and figures",
         f"would train     {total:,} {unit}, {program.epochs:,} epochs of {program.steps_per_epoch:,}, {seeds}",
-        f"would evaluate  every {trainer.eval_every} epochs, and save every {trainer.checkpoint_every}",
+        f"would evaluate  every {section.eval_every} epochs, and save every {section.checkpoint_every}",
         f"needs           at least {_mib(sum(needed.values()))} of memory ({parts}); "
-        f"there are {_mib(memory_budget.available(trainer.devices))}",
+        f"there are {_mib(memory_budget.available(section.devices))}",
     ]
     return "\n".join([*(f"# {line}" for line in lines), program.config.to_yaml().rstrip()])
 

@@ -42,11 +42,7 @@ def train(
     What cannot be written, as on a full disk, raises `UserError`. Several processes (`devices.join`) call this alike,
     and only the first of them writes anything but its share of the checkpoints.
     """
-    run_folder.check_name(run_dir)
-    sinks.check(config)
-    program = programs.build(config)
-    program.data()  # refused before anything is written
-    memory_budget.check(program)
+    program = ready(config, run_dir)
     first = devices.first()
     console = console or Console(stderr=True, quiet=not first)
     warn = partial(_warn, console)
@@ -76,6 +72,16 @@ def train(
             if result.interrupted:
                 return replace(result, env_steps=began, fault=None)
             profile = 0
+
+
+def ready(config: RunConfig, run_dir: Path) -> Program:
+    """The program of a run that can begin; raises `UserError` for one that cannot, before anything is written."""
+    run_folder.check_name(run_dir)
+    sinks.check(config)
+    program = programs.build(config)
+    program.data()
+    memory_budget.check(program)
+    return program
 
 
 def _begin(
