@@ -64,7 +64,8 @@ def test_a_mode_that_nothing_runs_in_is_named_in_one_line_and_leaves_nothing_beh
     command = [sys.executable, "-m", "star", "train", str(ROOT / "configs/point_maze.yaml"), "--run-dir", "run"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 2
-    assert done.stderr.startswith(f"error: {mode}: ") and done.stderr.count("\n") == 1
+    *of_jax, error = done.stderr.splitlines()  # JAX's own plugins may speak up first
+    assert error.startswith(f"error: {mode}: ") and "star" not in "".join(of_jax)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -374,7 +375,7 @@ def test_pictures_may_be_drawn_in_any_thread(can_draw):
 
 def test_a_process_forked_from_one_that_runs_jax_is_told_so_instead_of_hanging():
     gymnasium.make("star/PointMaze-v0")
-    with pytest.warns(RuntimeWarning, match="fork"):
+    with pytest.warns((RuntimeWarning, DeprecationWarning), match="fork"):  # JAX's, and that of Python 3.12
         child = os.fork()
     if child == 0:  # nothing of pytest may go on here
         try:

@@ -62,6 +62,7 @@ def test_a_dry_run_shows_the_settings_and_writes_nothing(word, folder, capsys):
 
 
 def test_a_sink_of_the_command_line_joins_those_of_the_config(folder, capsys):
+    pytest.importorskip("wandb")
     (folder / "run.yaml").write_text(json.dumps(RUN | {"trainer": RUN["trainer"] | {"sinks": ["tensorboard"]}}))
     assert main(["train", "run.yaml", "--dry-run", "--wandb", "--tensorboard"]) == 0
     assert parse(yaml.safe_load(capsys.readouterr().out)).trainer.sinks == ("tensorboard", "wandb")

@@ -117,6 +117,7 @@ def whole(path, *, seconds=30):
 
 
 def test_an_offline_run_of_wandb_goes_on_as_the_same_run_and_tells_nothing_twice(tmp_path, monkeypatch):
+    pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setattr(sinks, "_PATIENCE_S", 300)
     run_dir = tmp_path / "my_run"
