@@ -185,9 +185,12 @@ def split(abstraction: Abstraction, cut: Cut, *, min_width: float | Array) -> tu
 
 
 def coarse(abstraction: Abstraction, share: float | Array) -> Bool[Array, "R"]:
-    """Which regions are at least `share` times as large as each of R equal ones would be, R being the capacity."""
+    """Which regions are at least `share` times as large as each would be that is left, spread over the whole space.
+
+    The fewer are left, the larger they have to be; with none left, none is coarse but for a `share` of 0.
+    """
     widths, space = abstraction.upper - abstraction.lower, abstraction.space[1] - abstraction.space[0]
-    return jnp.prod(widths / space, axis=-1) * abstraction.capacity >= share
+    return jnp.prod(widths / space, axis=-1) * (abstraction.capacity - abstraction.count) >= share
 
 
 def adjacent(abstraction: Abstraction) -> Bool[Array, "R R"]:

@@ -349,8 +349,8 @@ def test_a_full_table_is_reported_and_stays_as_it_is(refine, moving):
 
 @pytest.mark.parametrize(
     ("limit", "value", "count"),
-    # A quarter of the space is 1.5 times what each of six equal regions would be.
-    [("min_width", 6.5, 4), ("min_width", 5.5, 5), ("min_share", 1.6, 4), ("min_share", 1.4, 5)],
+    # Two regions are left of six: a quarter of the space is half of what each would be, spread over the space.
+    [("min_width", 6.5, 4), ("min_width", 5.5, 5), ("min_share", 0.6, 4), ("min_share", 0.4, 5)],
 )
 def test_no_region_is_cut_narrower_than_min_width_or_that_is_smaller_than_min_share(
     refine, moving, limit, value, count
