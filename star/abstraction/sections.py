@@ -22,7 +22,7 @@ class AbstractionConfig(Section):
     )
     min_width: float = Field(1.0, gt=0, description="no region is cut narrower than this (units of the state)")
     min_share: float = Field(
-        0.0, ge=0, description="no region is cut that is smaller than this times the space over the regions left; 0: any"
+        0.0, ge=0, description="no region is cut below this times the space over the regions left; 0: any"
     )
 
 

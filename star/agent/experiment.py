@@ -113,6 +113,11 @@ class Star(Experiment):
             found["sgim"] = figures.sgim_figure(regions=tables, rows=rows, walls=self.walls)
         return found
 
+    def notes(self) -> list[str]:
+        """Levels that learn from old transitions: how often from each, on average."""
+        said = [(name, level.settings.samples_per_transition(size)) for name, level, size in self.config.learners()]
+        return [f"{name}: {samples:.3g} samples per new transition" for name, samples in said if samples is not None]
+
     def facts(self, rows: Sequence[Mapping[str, Any]]) -> Mapping[str, str]:
         """Regions and edges, SGIM's strategies, and faults of the simulator."""
         found = {}

@@ -11,7 +11,7 @@ import numpy as np
 
 from star.config.kinds import Arrays, Migration
 
-FORMAT = 5  # since PPO's critics speak of returns in running units
+FORMAT = 6  # since TD3 sees normalised observations
 
 
 def _count_for_both_aims(arrays: Arrays) -> Arrays:
@@ -34,8 +34,24 @@ def _returns_as_they_are(arrays: Arrays) -> Arrays:
     return arrays | new
 
 
+def _observations_as_they_are(arrays: Arrays) -> Arrays:
+    """TD3 saw observations as they are: mean 0 and variance 1, which weigh as much as a million transitions."""
+    new: Arrays = {}
+    for name, x in arrays.items():
+        level, learnt, _ = name.partition("/target/actor/params/Dense_0/kernel")
+        if learnt:
+            seeds, size = x.shape[:2]
+            new |= {
+                f"{level}/normalizer/mean": np.zeros((seeds, size), x.dtype),
+                f"{level}/normalizer/variance": np.ones((seeds, size), x.dtype),
+                f"{level}/normalizer/count": np.full(seeds, 1e6, x.dtype),
+            }
+    return arrays | new
+
+
 TO_NEXT: Mapping[int, Migration] = {
     2: Migration(),  # the same, in other files and without checksums
     3: Migration(arrays=_count_for_both_aims),
     4: Migration(arrays=_returns_as_they_are),
+    5: Migration(arrays=_observations_as_they_are),
 }

@@ -38,6 +38,10 @@ class LearnerConfig(Section):
         """Memory that an update takes besides state and rollout, at least."""
         return 0
 
+    def samples_per_transition(self, rollout: Rollout) -> float | None:
+        """Average number of times that a transition is learnt from; None: a run does not say it."""
+        return None
+
 
 def whole(state: Any) -> Any:
     """`state` with `WHOLE` in the place of every leaf: each device holds all of it."""

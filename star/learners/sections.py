@@ -94,6 +94,10 @@ class TD3Config(BufferedConfig, LearnerConfig):
         """What networks keep of a batch to learn from it."""
         return self.batch_size * sum(self.hidden) * NUMBER
 
+    def samples_per_transition(self, rollout: Rollout) -> float:
+        """Samples drawn after a rollout, for each transition in it."""
+        return self.updates_per_rollout * self.batch_size / rollout.size
+
 
 class LevelConfig(Section):
     """What Tutor and Controller have in common: a learner and a reward."""

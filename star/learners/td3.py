@@ -1,11 +1,12 @@
 """Twin delayed DDPG (Fujimoto, van Hoof and Meger 2018): the published learner of Tutor and Controller.
 
     y      = r + gamma (1 - terminated) min_i Q'_i(o', pi'(o') + clipped noise)
-    critic = sum_i E[(Q_i(o, a) - y)^2]
+    critic = sum_i E[huber(Q_i(o, a) - y)]
     actor  = -E[Q_1(o, pi(o))]                   # every `policy_delay` critic updates
     targets follow with rate tau
 
-Every rollout enters the replay buffer, then `updates_per_rollout` batches are drawn from it.
+Every rollout enters the replay buffer, then `updates_per_rollout` batches are drawn from it. Networks see observations
+with running mean 0 and variance 1. Of many environments some explore hardly and some a lot (FastTD3, Seo et al. 2025).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from star import devices
 from star.learners import replay
-from star.learners.networks import MLP, apply
+from star.learners.networks import MLP, Normalizer, apply
 from star.learners.protocol import Learner, whole
 from star.learners.replay import Imitation, Penalty, Relabel, Transition, flatten, weighted_mean
 from star.learners.sections import TD3Config
@@ -31,12 +32,13 @@ Metrics = dict[str, Array]
 
 
 class TD3State(struct.PyTreeNode):
-    """Networks with their targets, two optimisers and the replay buffer of one TD3 learner."""
+    """Networks with their targets, two optimisers, observation statistics and the replay buffer of one TD3 learner."""
 
     params: Mapping[str, Any]
     target: Mapping[str, Any]
     actor_optimizer: optax.OptState
     critic_optimizer: optax.OptState
+    normalizer: Normalizer
     ring: replay.Ring
     updates: Int[Array, ""]
 
@@ -70,6 +72,7 @@ def init(key: Array, config: TD3Config, *, example: Transition) -> TD3State:
         target=jax.tree.map(jnp.copy, params),
         actor_optimizer=adam.init(params["actor"]),
         critic_optimizer=adam.init(params["critic"]),
+        normalizer=Normalizer.create(len(example.obs)),
         ring=replay.create(example, size=config.buffer_size),
         updates=jnp.zeros((), jnp.int32),
     )
@@ -79,10 +82,19 @@ def act(
     config: TD3Config, state: TD3State, obs: Float[Array, "*batch obs"], *, deterministic: bool = False, key: Array
 ) -> Float[Array, "*batch act"]:
     """Actions in [-1, 1], with Gaussian exploration noise unless `deterministic`."""
-    action = _policy(config, state.params["actor"], obs, _action_size(state))
+    action = _policy(config, state.params["actor"], state.normalizer(obs), _action_size(state))
     if deterministic:
         return action
-    return jnp.clip(action + config.exploration_noise * jax.random.normal(key, action.shape), -1.0, 1.0)
+    noise = config.exploration_noise * _spread(action) * jax.random.normal(key, action.shape)
+    return jnp.clip(action + noise, -1.0, 1.0)
+
+
+def _spread(action: Float[Array, "*batch act"]) -> Float[Array, "*batch 1"] | float:
+    """Factors on the noise of each environment, the first axis: evenly from 0 to 2, and 1 for a single one."""
+    if action.ndim == 1:
+        return 1.0
+    number = action.shape[0]
+    return ((2 * jnp.arange(number) + 1) / number).reshape(-1, *(1,) * (action.ndim - 1))
 
 
 def update(
@@ -100,7 +112,13 @@ def update(
     `penalty(batch, action)` [N] is added to the loss of the actor that would take `action`, and so is that of
     `imitation`.
     """
-    state = state.replace(ring=replay.add(state.ring, flatten(devices.whole(rollout))))
+    rollout = devices.whole(rollout)
+    state = state.replace(
+        ring=replay.add(state.ring, flatten(rollout)),
+        normalizer=state.normalizer.update(rollout.obs, rollout.weight),
+    )
+    if imitation is not None:
+        imitation = imitation.replace(obs=state.normalizer(imitation.obs))
     state, metrics = jax.lax.scan(
         partial(_one_update, config, relabel, penalty, imitation),
         state,
@@ -121,17 +139,18 @@ def _one_update(
     batch = devices.whole(replay.sample(state.ring, sample_key, batch_size=config.batch_size))
     if relabel is not None:
         batch = relabel(batch, relabel_key)
+    seen = batch.replace(obs=state.normalizer(batch.obs), next_obs=state.normalizer(batch.next_obs))
     ready = replay.filled(state.ring) >= min(config.min_transitions, replay.capacity(state.ring))
     act_too = ready & (state.updates % config.policy_delay == 0)
 
     critic_grad, critic_metrics = jax.grad(partial(_critic_loss, config), has_aux=True)(
-        state.params["critic"], state.target, batch, noise_key
+        state.params["critic"], state.target, seen, noise_key
     )
     critic, critic_optimizer = _adam_step(
         state.params["critic"], critic_grad, state.critic_optimizer, config.critic_learning_rate, ready
     )
     actor_grad, actor_metrics = jax.grad(partial(_actor_loss, config, penalty, imitation), has_aux=True)(
-        state.params["actor"], critic, batch
+        state.params["actor"], critic, seen, batch
     )
     actor, actor_optimizer = _adam_step(
         state.params["actor"], actor_grad, state.actor_optimizer, config.actor_learning_rate, act_too
@@ -157,7 +176,7 @@ def _critic_loss(config: TD3Config, params: Any, target: Any, batch: Transition,
     next_q = _q(config, target["critic"], batch.next_obs, jnp.clip(next_action + noise, -1.0, 1.0)).min(axis=0)
     goal = batch.reward + config.discount * (1 - batch.terminated) * next_q
     q = _q(config, params, batch.obs, batch.action)
-    loss = weighted_mean(jnp.square(q - goal).sum(axis=0), batch.weight)
+    loss = weighted_mean(optax.huber_loss(q, goal).sum(axis=0), batch.weight)
     return loss, {"critic_loss": loss, "q": weighted_mean(q[0], batch.weight)}
 
 
@@ -167,11 +186,13 @@ def _actor_loss(
     imitation: Imitation | None,
     params: Any,
     critic: Any,
+    seen: Transition,
     batch: Transition,
 ) -> tuple[Array, Metrics]:
-    action = _policy(config, params, batch.obs, batch.action.shape[-1])
+    """`seen` is the `batch` with normalised observations; the penalty is told of the batch as it is."""
+    action = _policy(config, params, seen.obs, batch.action.shape[-1])
     price = penalty(batch, action) if penalty is not None else 0.0
-    loss = weighted_mean(price - _q(config, critic, batch.obs, action)[0], batch.weight)
+    loss = weighted_mean(price - _q(config, critic, seen.obs, action)[0], batch.weight)
     if imitation is not None:
         loss += imitation.loss(_policy(config, params, imitation.obs, batch.action.shape[-1]))
     return loss, {"actor_loss": loss}

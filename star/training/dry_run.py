@@ -23,6 +23,7 @@ def told(config: RunConfig, run_dir: Path) -> str:
         f"would evaluate  every {section.eval_every} epochs, and save every {section.checkpoint_every}",
         f"needs           at least {_mib(sum(needed.values()))} of memory ({parts}); "
         f"there are {_mib(memory_budget.available(section.devices))}",
+        *program.experiment.notes(),
     ]
     return "\n".join([*(f"# {line}" for line in lines), program.config.to_yaml().rstrip()])
 

@@ -91,6 +91,10 @@ class Experiment:
         """Matplotlib figures by their names, from all rows of metrics and of `tables`."""
         return {"summary": measures_figure(rows, self.config)}
 
+    def notes(self) -> list[str]:
+        """Lines that a run says before it starts."""
+        return []
+
     def facts(self, rows: Sequence[Row]) -> Mapping[str, str]:
         """What the console says of the latest epoch, besides measures."""
         return {}

@@ -92,6 +92,8 @@ class Loop:
         """Train from `state` to the end, to a signal, or until numbers are no longer finite."""
         program, muted = self._program, not devices.first()
         self._say_what_is_rounded()
+        for line in program.experiment.notes():
+            self._display.note(line)
         history = self._recorder.journal.metrics.read() if program.config.trainer.sinks else []
         self._stop.on_first = self._display.stop
         try:

@@ -61,6 +61,14 @@ def test_a_dry_run_shows_the_settings_and_writes_nothing(word, folder, capsys):
     assert "runs/run-<time>" in out and "would train     720 env steps, 3 epochs of 240, 2 seeds" in out
 
 
+def test_a_dry_run_says_how_often_a_level_learns_from_what_is_new(folder, capsys):
+    (folder / "run.yaml").write_text(json.dumps(RUN | {"tutor": RUN["tutor"] | {"unroll": 2}}))
+    td3 = "--tutor.learner td3 --tutor.td3.batch_size 30 --tutor.td3.updates_per_rollout 4 --trainer.num_envs 12"
+    assert main(["train", "run.yaml", "--dry-run", *td3.split()]) == 0
+    assert "# tutor: 5 samples per new transition\n" in (out := capsys.readouterr().out)  # 4 * 30 for 2 * 12
+    assert "controller: " not in out
+
+
 def test_a_sink_of_the_command_line_joins_those_of_the_config(folder, capsys):
     pytest.importorskip("wandb")
     (folder / "run.yaml").write_text(json.dumps(RUN | {"trainer": RUN["trainer"] | {"sinks": ["tensorboard"]}}))

@@ -7,6 +7,7 @@ import pytest
 
 from star.config import loading
 from star.learners import replay, td3
+from star.learners.networks import Normalizer
 from star.learners.replay import Transition
 
 
@@ -67,24 +68,35 @@ def slow_qs(critics, obs, action):
     return [slow_mlp(jax.tree.map(lambda p, i=i: p[i], critics), x)[0] for i in range(2)]
 
 
-@pytest.mark.parametrize("terminated", [0.0, 1.0])
-def test_the_critics_aim_at_the_smaller_target_and_do_not_bootstrap_past_a_termination(start, update, terminated):
+@pytest.mark.parametrize(("terminated", "scale"), [(0.0, 1.0), (1.0, 1.0), (1.0, 50.0)])
+def test_the_critics_aim_at_the_smaller_target_and_do_not_bootstrap_past_a_termination(
+    start, update, terminated, scale
+):
     chosen = settings(target_noise=0.0, discount=0.9)
+    known = Normalizer(mean=jnp.array([0.1, -0.2, 0.3]), variance=jnp.array([0.5, 1.0, 2.0]), count=jnp.array(1e9))
     one = random_rollout(1)
+    one = one.replace(reward=scale * one.reward, terminated=np.full((1, 1), terminated, np.float32))
     rollout = jax.tree.map(lambda x: np.repeat(x, 16, axis=1), one)  # any batch is made of this one
-    rollout = rollout.replace(terminated=np.full((1, 16), terminated, np.float32))
-    obs, action, reward, next_obs = (np.float64(x[0, 0]) for x in (one.obs, one.action, one.reward, one.next_obs))
+    action, reward = np.float64(one.action[0, 0]), np.float64(one.reward[0, 0])
+    obs, next_obs = (
+        (np.float64(x[0, 0]) - np.float64(known.mean)) / np.sqrt(np.float64(known.variance) + 1e-4)
+        for x in (one.obs, one.next_obs)
+    )
     next_action = np.tanh(slow_mlp(start.target["actor"], next_obs))
     goal = reward + 0.9 * (1 - terminated) * min(slow_qs(start.target["critic"], next_obs, next_action))
-    expected = sum((q - goal) ** 2 for q in slow_qs(start.params["critic"], obs, action))
-    _, metrics = update(chosen, start, rollout, jax.random.key(1))
+    errors = [abs(q - goal) for q in slow_qs(start.params["critic"], obs, action)]
+    expected = sum(error**2 / 2 if error < 1 else error - 0.5 for error in errors)
+    assert (min(errors) > 1) == (scale > 1), "both parts of the loss are seen"
+    _, metrics = update(chosen, start.replace(normalizer=known), rollout, jax.random.key(1))
     np.testing.assert_allclose(metrics["critic_loss"], expected, rtol=1e-4)
 
 
 def test_there_is_no_update_before_enough_transitions(start, update):
     state, _ = update(settings(), start, random_rollout(7), jax.random.key(1))
     assert int(state.updates) == 0 and int(replay.filled(state.ring)) == 7
-    jax.tree.map(np.testing.assert_array_equal, state.replace(ring=None), start.replace(ring=None))
+    same = {"ring": None, "normalizer": None}
+    jax.tree.map(np.testing.assert_array_equal, state.replace(**same), start.replace(**same))
+    np.testing.assert_allclose(state.normalizer.mean, random_rollout(7).obs[0].mean(axis=0), atol=1e-6)
     state, _ = update(settings(), state, random_rollout(1), jax.random.key(1))
     assert int(state.updates) == 1
 
@@ -123,7 +135,7 @@ def test_relabelling_applies_to_the_batches_but_not_to_the_buffer(start):
 
     run = jax.jit(lambda r, key: td3.update(settings(), start, r, relabel=relabel, key=key))
     state, metrics = run(random_rollout(16), jax.random.key(1))
-    assert float(metrics["critic_loss"]) > 1000
+    assert float(metrics["critic_loss"]) > 150
     assert float(jnp.abs(replay.contents(state.ring)[0].reward).max()) <= 1
 
 
@@ -137,6 +149,16 @@ def test_actions_stay_in_range_and_noise_is_for_exploration_only(start):
     assert float(jnp.abs(noisy).max()) <= 1
     np.testing.assert_allclose(jnp.clip(noisy, -0.9, 0.9).mean(0), still[0], atol=0.05)
     assert (noisy.std(0) > 0.3).all()
+
+
+def test_of_many_environments_the_first_hardly_explore_and_the_last_do_twice_as_much_as_the_mean(start):
+    chosen, obs = settings(exploration_noise=0.1), jnp.zeros((4, 3))
+    keys = jax.random.split(jax.random.key(0), 2000)
+    still = td3.act(chosen, start, obs[0], deterministic=True, key=keys[0])
+    noise = jax.vmap(lambda key: td3.act(chosen, start, obs, key=key))(keys) - still
+    np.testing.assert_allclose(noise.std(axis=(0, 2)), [0.025, 0.075, 0.125, 0.175], rtol=0.05)
+    alone = jax.vmap(lambda key: td3.act(chosen, start, obs[0], key=key))(keys) - still
+    np.testing.assert_allclose(alone.std(), 0.1, rtol=0.05)
 
 
 def test_it_learns_the_best_action_of_a_one_step_task():

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from star.agent.sections import Config
 from star.config import kinds
 from star.config.kinds import Migration
 from star.training import checkpoint
+from star.training import program as programs
 from star.training.checkpoint import Checkpoints, Damaged, best, choose, kept, newest
 from tests.small import unpacked
 
@@ -306,6 +308,16 @@ def test_the_critics_of_format_4_speak_of_returns_as_they_are(tmp_path):
     assert set(after) - set(before) == set(new) and set(before) <= set(after)
     for name, x in new.items():
         np.testing.assert_array_equal(after[name], [x, x])
+    checkpoints.close()
+
+
+def test_td3_of_format_5_saw_observations_as_they_are(tmp_path):
+    checkpoints = Checkpoints(unpacked("format_5", tmp_path))
+    program = programs.build(checkpoints.config(480))
+    state = checkpoints.restore(480, jax.eval_shape(program.init, program.seed_keys()))
+    normalizer = state.tutor.normalizer
+    assert normalizer.mean.shape[0] == 2 and not normalizer.mean.any() and (normalizer.variance == 1).all()
+    np.testing.assert_array_equal(normalizer.count, [1e6, 1e6])
     checkpoints.close()
 
 
