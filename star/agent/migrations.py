@@ -10,8 +10,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from star.config.kinds import Arrays, Migration
+from star.learners.sections import TD3Config
 
-FORMAT = 6  # since TD3 sees normalised observations
+FORMAT = 6  # since TD3 sees normalised observations, and rewards in running units
 
 
 def _count_for_both_aims(arrays: Arrays) -> Arrays:
@@ -35,8 +36,12 @@ def _returns_as_they_are(arrays: Arrays) -> Arrays:
 
 
 def _observations_as_they_are(arrays: Arrays) -> Arrays:
-    """TD3 saw observations as they are: mean 0 and variance 1, which weigh as much as a million transitions."""
+    """TD3 saw observations and rewards as they are: statistics that say so weigh as much as a million transitions.
+
+    The unit of rewards is 1 with the default discount.
+    """
     new: Arrays = {}
+    square = 1 - TD3Config().discount ** 2
     for name, x in arrays.items():
         level, learnt, _ = name.partition("/target/actor/params/Dense_0/kernel")
         if learnt:
@@ -45,6 +50,9 @@ def _observations_as_they_are(arrays: Arrays) -> Arrays:
                 f"{level}/normalizer/mean": np.zeros((seeds, size), x.dtype),
                 f"{level}/normalizer/variance": np.ones((seeds, size), x.dtype),
                 f"{level}/normalizer/count": np.full(seeds, 1e6, x.dtype),
+                f"{level}/rewards/mean": np.zeros((seeds, 1), x.dtype),
+                f"{level}/rewards/variance": np.full((seeds, 1), square, x.dtype),
+                f"{level}/rewards/count": np.full(seeds, 1e6, x.dtype),
             }
     return arrays | new
 

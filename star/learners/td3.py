@@ -6,7 +6,11 @@
     targets follow with rate tau
 
 Every rollout enters the replay buffer, then `updates_per_rollout` batches are drawn from it. Networks see observations
-with running mean 0 and variance 1. Of many environments some explore hardly and some a lot (FastTD3, Seo et al. 2025).
+with running mean 0 and variance 1, and r is in running units, so that the scale of rewards does not matter.
+
+Until the first update actions are drawn evenly, and critics begin flat. Else actors follow slopes that nobody has
+measured to where tanh ends, and a body stands still there. Of many environments some explore hardly and some a lot
+(FastTD3, Seo et al. 2025).
 """
 
 from __future__ import annotations
@@ -30,6 +34,8 @@ from star.learners.sections import TD3Config
 
 Metrics = dict[str, Array]
 
+_LEAST = 1e-6  # deviation of rewards
+
 
 class TD3State(struct.PyTreeNode):
     """Networks with their targets, two optimisers, observation statistics and the replay buffer of one TD3 learner."""
@@ -39,6 +45,7 @@ class TD3State(struct.PyTreeNode):
     actor_optimizer: optax.OptState
     critic_optimizer: optax.OptState
     normalizer: Normalizer
+    rewards: Normalizer
     ring: replay.Ring
     updates: Int[Array, ""]
 
@@ -47,10 +54,14 @@ def _actor(config: TD3Config, action_size: int) -> MLP:
     return MLP(config.hidden, action_size, final_scale=0.01)
 
 
+def _critic(config: TD3Config) -> MLP:
+    return MLP(config.hidden, 1, final_scale=0.01)
+
+
 def _q(config: TD3Config, params: Any, obs: Array, action: Array) -> Float[Array, "2 *batch"]:
     """Both critics; their parameters are stacked on a leading axis."""
     x = jnp.concatenate([obs, action], axis=-1)
-    return jax.vmap(lambda one: apply(MLP(config.hidden, 1), one, x)[..., 0])(params)
+    return jax.vmap(lambda one: apply(_critic(config), one, x)[..., 0])(params)
 
 
 def _policy(config: TD3Config, params: Any, obs: Array, action_size: int) -> Array:
@@ -64,7 +75,7 @@ def init(key: Array, config: TD3Config, *, example: Transition) -> TD3State:
     both = jnp.concatenate([example.obs, example.action])
     params = {
         "actor": _actor(config, action_size).init(actor_key, example.obs),
-        "critic": jax.vmap(lambda k: MLP(config.hidden, 1).init(k, both))(jax.random.split(critic_key)),
+        "critic": jax.vmap(lambda k: _critic(config).init(k, both))(jax.random.split(critic_key)),
     }
     adam = optax.scale_by_adam()
     return TD3State(
@@ -73,6 +84,7 @@ def init(key: Array, config: TD3Config, *, example: Transition) -> TD3State:
         actor_optimizer=adam.init(params["actor"]),
         critic_optimizer=adam.init(params["critic"]),
         normalizer=Normalizer.create(len(example.obs)),
+        rewards=Normalizer.create(1),
         ring=replay.create(example, size=config.buffer_size),
         updates=jnp.zeros((), jnp.int32),
     )
@@ -81,12 +93,13 @@ def init(key: Array, config: TD3Config, *, example: Transition) -> TD3State:
 def act(
     config: TD3Config, state: TD3State, obs: Float[Array, "*batch obs"], *, deterministic: bool = False, key: Array
 ) -> Float[Array, "*batch act"]:
-    """Actions in [-1, 1], with Gaussian exploration noise unless `deterministic`."""
+    """Actions in [-1, 1], with Gaussian exploration noise unless `deterministic`; before the first update anything."""
     action = _policy(config, state.params["actor"], state.normalizer(obs), _action_size(state))
     if deterministic:
         return action
     noise = config.exploration_noise * _spread(action) * jax.random.normal(key, action.shape)
-    return jnp.clip(action + noise, -1.0, 1.0)
+    anything = jax.random.uniform(jax.random.fold_in(key, 1), action.shape, minval=-1.0)
+    return jnp.where(state.updates == 0, anything, jnp.clip(action + noise, -1.0, 1.0))
 
 
 def _spread(action: Float[Array, "*batch act"]) -> Float[Array, "*batch 1"] | float:
@@ -116,6 +129,7 @@ def update(
     state = state.replace(
         ring=replay.add(state.ring, flatten(rollout)),
         normalizer=state.normalizer.update(rollout.obs, rollout.weight),
+        rewards=state.rewards.update(rollout.reward[..., None], rollout.weight),
     )
     if imitation is not None:
         imitation = imitation.replace(obs=state.normalizer(imitation.obs))
@@ -139,7 +153,11 @@ def _one_update(
     batch = devices.whole(replay.sample(state.ring, sample_key, batch_size=config.batch_size))
     if relabel is not None:
         batch = relabel(batch, relabel_key)
-    seen = batch.replace(obs=state.normalizer(batch.obs), next_obs=state.normalizer(batch.next_obs))
+    seen = batch.replace(
+        obs=state.normalizer(batch.obs),
+        next_obs=state.normalizer(batch.next_obs),
+        reward=batch.reward / unit(config, state.rewards),
+    )
     ready = replay.filled(state.ring) >= min(config.min_transitions, replay.capacity(state.ring))
     act_too = ready & (state.updates % config.policy_delay == 0)
 
@@ -167,6 +185,12 @@ def _one_update(
         ),
         critic_metrics | actor_metrics,
     )
+
+
+def unit(config: TD3Config, rewards: Normalizer) -> Float[Array, ""]:
+    """Deviation that returns would have if rewards were independent: the unit of the critics."""
+    power = rewards.variance[0] + jnp.square(rewards.mean[0])
+    return jnp.maximum(jnp.sqrt(power / jnp.maximum(1 - jnp.square(config.discount), _LEAST)), _LEAST)
 
 
 def _critic_loss(config: TD3Config, params: Any, target: Any, batch: Transition, key: Array) -> tuple[Array, Metrics]:

@@ -20,6 +20,7 @@ from star.agent.migrations import FORMAT
 from star.agent.sections import Config
 from star.config import kinds
 from star.config.kinds import Migration
+from star.learners import td3
 from star.training import checkpoint
 from star.training import program as programs
 from star.training.checkpoint import Checkpoints, Damaged, best, choose, kept, newest
@@ -194,6 +195,7 @@ from star.training.checkpoint import Checkpoints
 from star.agent.sections import Config
 from star.config import kinds
 from star.config.kinds import Migration
+from star.learners import td3
 from envs.common.errors import UserError
 from star.training.lock import locked
 from star.training.journal import JsonLines
@@ -311,13 +313,16 @@ def test_the_critics_of_format_4_speak_of_returns_as_they_are(tmp_path):
     checkpoints.close()
 
 
-def test_td3_of_format_5_saw_observations_as_they_are(tmp_path):
+def test_td3_of_format_5_saw_observations_and_rewards_as_they_are(tmp_path):
     checkpoints = Checkpoints(unpacked("format_5", tmp_path))
     program = programs.build(checkpoints.config(480))
     state = checkpoints.restore(480, jax.eval_shape(program.init, program.seed_keys()))
     normalizer = state.tutor.normalizer
     assert normalizer.mean.shape[0] == 2 and not normalizer.mean.any() and (normalizer.variance == 1).all()
     np.testing.assert_array_equal(normalizer.count, [1e6, 1e6])
+    learner = program.config.tutor.td3
+    unit = jax.vmap(lambda rewards: td3.unit(learner, rewards))(state.tutor.rewards)
+    np.testing.assert_allclose(unit, [1, 1], rtol=1e-5)
     checkpoints.close()
 
 
