@@ -77,6 +77,11 @@ class Spec:
         """The task goal g* in an observation."""
         return obs[..., self.state_dim :]
 
+    def success(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch"]:
+        """1 where the goal counts as reached, else 0."""
+        distance = jnp.linalg.norm(obs[..., np.asarray(self.goal_indices)] - self.goal(obs), axis=-1)
+        return (distance < self.success_radius).astype(jnp.float32)
+
     def abstract(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch d"]:
         """The abstract dimensions of an observation."""
         return obs[..., np.asarray(self.abstract_indices)]

@@ -28,13 +28,13 @@ from matplotlib import pyplot
 from rich.console import Console
 
 import envs
-from envs.common import reading
+from envs.common import files, reading
 from envs.common.errors import UserError
 from star import cli, sgim
 from star.abstraction import regions
 from star.agent import environment
 from star.cli.streams import unbroken
-from star.cli.words import new_place, split_settings
+from star.cli.words import split_settings
 from star.config import plugins
 from star.config.loading import parse
 from star.sgim import teachers
@@ -316,7 +316,7 @@ def test_a_folder_that_orbax_takes_for_a_pattern_is_refused(name, tmp_path, caps
 
 
 def test_two_commands_in_one_second_get_a_place_each(tmp_path):
-    places = {new_place(tmp_path / "runs", "maze") for _ in range(3)}
+    places = {files.new_place(tmp_path / "runs", "maze") for _ in range(3)}
     assert len(places) == 3 and all(place.is_dir() for place in places)
 
 

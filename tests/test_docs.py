@@ -22,6 +22,7 @@ from star.config.loading import fields, load, parse
 from star.sweeps import work
 from star.training import program as programs
 from star.training import trainer
+from tests import small as smaller
 
 ROOT = Path(__file__).parents[1]
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("docs/*.md"))}
@@ -83,7 +84,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(exam_results, "check_groups", lambda groups, configs: None)
     monkeypatch.setattr(exam_results, "compare", lambda rows, groups: None)
     monkeypatch.setattr(exam_tables, "show", lambda rows, comparison, **_: None)
-    monkeypatch.setattr(star_commands, "_check_output", lambda options: None)  # pictures need OpenGL, films ffmpeg
+    monkeypatch.setattr(star_commands, "check_output", lambda out, force: None)  # pictures need OpenGL, films ffmpeg
     monkeypatch.setattr(films, "render", lambda config, show, **_: "")
     monkeypatch.setattr("star.report.page.write", lambda runs, out, **_: "")
     monkeypatch.setattr(work, "run", lambda found, out, **_: work.Summary([], True, {"trial": 0}))
@@ -312,6 +313,22 @@ def test_the_example_of_the_how_to_page_plays_a_trained_agent(run, tmp_path, mon
     assert abs(last - end.episode.distance).max() < 1  # an env step later
     said, *_ = capsys.readouterr().out.splitlines()
     assert said == f"success at any step: {end.episode.success_any.mean()} at the last: 0.0"
+
+
+def test_the_examples_of_the_python_page_act_train_and_evaluate(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "NAME").symlink_to(run)
+    (tmp_path / "point_maze").write_text(
+        json.dumps(smaller.RUN | {"trainer": smaller.RUN["trainer"] | {"total_env_steps": 240}})
+    )
+    act, train = blocks("docs/python.md", "python")
+    names: dict = {}
+    exec(act.replace('goals="test"', 'goals="test", episode_length=40'), names)
+    assert names["truncated"] and names["agent"].env_steps == 160
+    exec(train.replace("200", "4"), names)
+    assert (names["result"]["env_steps"], len(names["row"]["seeds"]), names["row"]["episodes"]) == (240, 2, 8)
+    assert capsys.readouterr().out.startswith("reached: False at [")
 
 
 def test_the_example_of_the_sgim_page_learns_all_three_exercises_and_asks_the_teacher():

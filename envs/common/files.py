@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import difflib
 import hashlib
+import itertools
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 
 from envs.common.errors import UserError
@@ -55,6 +57,34 @@ def whole(path: Path) -> Iterator[Path]:
             sync(path.parent)
     except OSError as error:
         raise UserError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+def new_place(folder: Path, name: str) -> Path:
+    """A new place in `folder`, named after the time. It is made at once, so that no other command takes it."""
+    first = folder / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    places = itertools.chain([first], (first.with_name(f"{first.name}-{number}") for number in itertools.count(2)))
+    for place in places:
+        try:
+            check_name(place)
+            place.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise UserError(f"{place}: cannot be written: {error.strerror}") from None
+        return place
+    raise AssertionError
+
+
+@contextlib.contextmanager
+def given_back(place: Path) -> Iterator[None]:
+    """If what is done here is refused, remove the new `place` for it, and the folder around, as far as empty."""
+    try:
+        yield
+    except UserError:
+        with contextlib.suppress(OSError):
+            place.rmdir()
+            place.parent.rmdir()
+        raise
 
 
 def sha256(path: Path) -> str:

@@ -196,11 +196,9 @@ def experience(
 ) -> tuple[Memory, Finished]:
     """The memory after a segment, and the periods that came to their end with it; weight 0 elsewhere."""
     worthy = worth(section, segment.distance, segment.success)
-    steps = len(segment.alive)
     last = jnp.sum(worthy * segment.terminated * segment.alive, axis=0)
-    memory = memory.replace(
-        reward=accumulate(section, memory.reward, worthy, segment.alive), clock=(memory.clock + steps) % section.period
-    )
+    memory = tick(section, memory, steps=len(segment.alive))
+    memory = memory.replace(reward=accumulate(section, memory.reward, worthy, segment.alive))
     end, lost = task.spec.abstract(segment.obs[-1]), segment.lost
     early = jnp.maximum(segment.ended[-1], lost)  # what is lost in the last step of an episode has not `ended` early
     whole_segment = segment.alive[-1] * (1 - early)
@@ -222,6 +220,11 @@ def experience(
     )
     box = memory.box
     return memory, Finished(decision, Outcome(memory.start, box.lower, box.upper, end, weight))
+
+
+def tick(section: CommanderConfig, memory: Memory, *, steps: int) -> Memory:
+    """The memory with its clock moved on by so many env steps."""
+    return memory.replace(clock=(memory.clock + steps) % section.period)
 
 
 def renewed(memory: Memory) -> Bool[Array, "B"]:

@@ -44,13 +44,23 @@ def evaluate(
     return 0
 
 
+def measure(run_dir: Path, overrides: Mapping[str, Any], *, checkpoint: str, seed: int) -> list[dict[str, Any]]:
+    """A row of plain values for each checkpoint, as `star evaluate --json` prints it; raises `UserError`."""
+    task, others = _split_task(overrides)
+    config = load_to_act(run_dir, others)
+
+    from star.agent import exams
+
+    return exams.evaluate([exams.Target(run_dir, checkpoint, config)], exams.Exam(seed=seed, task=task))
+
+
 def _grid(options: argparse.Namespace) -> int | None:
     if options.goals == "test" and options.grid is not None:
         raise ConfigError("--grid: needs --goals grid")
     return (options.grid or 8) if options.goals == "grid" else None
 
 
-def _split_task(overrides: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+def _split_task(overrides: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The settings that send an agent to another task than its own, and the others."""
     task = {k: v for k, v in overrides.items() if k == "env.name" or k.split(".")[:2] == ["env", "options"]}
     return task, {k: v for k, v in overrides.items() if k not in task}
@@ -93,7 +103,7 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         config = load_to_act(options.run, others)
         if options.task not in (None, config.env.name):
             raise ConfigError(f"{options.run}: its agent was trained on {config.env.name}, not on {options.task}")
-    _check_output(options)
+    check_output(options.out, force=options.force)
 
     from star.agent import exams, films
 
@@ -121,11 +131,11 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     return 0
 
 
-def _check_output(options: argparse.Namespace) -> None:
-    """Refuse a file that cannot be written, or a machine that cannot draw, before anything heavy is imported."""
+def check_output(out: Path, *, force: bool) -> None:
+    """Refuse a picture that cannot be written, or a machine that cannot draw, before anything heavy is imported."""
     from envs import opengl, video
 
-    video.check(options.out, force=options.force)
+    video.check(out, force=force)
     opengl.backend()
 
 

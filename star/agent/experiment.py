@@ -54,11 +54,12 @@ class Star(Experiment):
         self._trained = VectorEnv(env, config.trainer.num_envs, auto_reset=False)
         surplus = -config.trainer.eval_episodes % config.trainer.devices  # each device plays as many
         self._tested = VectorEnv(test_env, config.trainer.eval_episodes + surplus, auto_reset=False)
-        self._on_test = self.spec.within(test_env)
-        if self._on_test.episode_length % config.tutor.period:
+        self.tested_spec = self.spec.within(test_env)
+        """The same in test episodes."""
+        if self.tested_spec.episode_length % config.tutor.period:
             raise ConfigError(
                 f"tutor.period: {config.tutor.period} does not divide the test episode of "
-                f"{self._on_test.episode_length}"
+                f"{self.tested_spec.episode_length}"
             )
         self.steps_per_epoch = config.trainer.num_envs * self.spec.episode_length
         self.walls = np.asarray(env.walls)
@@ -87,7 +88,7 @@ class Star(Experiment):
     @over_seeds
     def evaluate(self, hyper: AgentConfig, state: TrainState, key: jax.Array) -> Episode:
         """Greedy episodes on test goals."""
-        played = play.evaluate(hyper, self._on_test, self._tested, state, key=key)
+        played = play.evaluate(hyper, self.tested_spec, self._tested, state, key=key)
         return jax.tree.map(lambda x: x[: self.config.trainer.eval_episodes], devices.whole(played))
 
     def rows(self, evaluated: Episode) -> list[dict[str, Any]]:

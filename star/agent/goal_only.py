@@ -9,13 +9,13 @@ from jaxtyping import Array, Bool, Float
 
 from envs.common.batching import where
 from star.abstraction import regions
-from star.agent.commander import blank, init
+from star.agent.commander import blank, init, tick
 from star.agent.decisions import Finished, Memory, Roadmap, Scene, target_box
 from star.agent.sections import CommanderConfig
 from star.agent.segments import Segment
 from star.agent.task import Task
 
-__all__ = ["ahead_of_time", "begin", "command", "experience", "in_vain", "init", "observe", "renewed", "settle"]
+__all__ = ["ahead_of_time", "begin", "command", "experience", "in_vain", "init", "observe", "renewed", "settle", "tick"]
 
 
 def begin(section: CommanderConfig, position: Float[Array, "B d"], *_: Any, **__: Any) -> Memory:
@@ -44,7 +44,7 @@ def experience(
     section: CommanderConfig, task: Task, roadmap: Roadmap, memory: Memory, segment: Segment, *_: Any
 ) -> tuple[Memory, Finished]:
     """Periods pass, and nothing is told of them."""
-    return memory.replace(clock=(memory.clock + len(segment.alive)) % section.period), Finished(None, None)
+    return tick(section, memory, steps=len(segment.alive)), Finished(None, None)
 
 
 def renewed(memory: Memory) -> Bool[Array, "B"]:

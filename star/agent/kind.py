@@ -62,6 +62,8 @@ STAR = Kind(
         "render": _lazily("commands", "render"),
         "record": _lazily("commands", "record"),
         "envs": _lazily("commands", "envs"),
+        "measure": _lazily("commands", "measure"),
+        "load": _lazily("acting", "load"),
         "map": _lazily("growth_map", "growth_map"),
     },
 )

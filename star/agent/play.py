@@ -21,8 +21,9 @@ from envs._quiet import State as EnvState
 from envs.common.batching import where
 from envs.vector import VectorEnv
 from star.abstraction.regions import Box
-from star.agent import levels
-from star.agent.decisions import Memory, Roadmap, Scene
+from star.agent import hierarchy, levels
+from star.agent.decisions import Memory, Roadmap
+from star.agent.hierarchy import Keys
 from star.agent.levels import Agent
 from star.agent.sections import AgentConfig
 from star.agent.segments import Choice, Segment
@@ -95,22 +96,19 @@ def greedy(
     place of those that the task draws; the starts stay the same.
     """
     agent = levels.of(config, spec, greedy=True)
-    reset_key, scan_key = jax.random.split(key)
     segments = spec.episode_length // config.tutor.period
+    reset_key, keys = hierarchy.segment_keys(key, segments)
     streams = start(agent, env, goals=goals, decisions=segments, key=reset_key)
-    roadmap = Roadmap.of(config.commander, state.abstraction, state.graph)
-    settled = agent.commander.settle(config.commander, state.commander, roadmap, episode_length=spec.episode_length)
-    state = state.replace(commander=settled)
+    state, roadmap = hierarchy.prepare(agent, state)
 
-    def one(streams: Streams, key: Array) -> tuple[Streams, Any]:
-        command_key, tutor_key, rollout_key = jax.random.split(key, 3)
-        keys = (command_key, tutor_key, rollout_key)
-        streams, passed, marks = segment(agent, env, state, roadmap, streams, env_steps=None, record=record, keys=keys)
-        memory, _ = agent.commander.experience(config.commander, agent.task, roadmap, streams.memory, passed, marks)
-        memory = agent.commander.ahead_of_time(config.commander, roadmap, memory, spec.abstract(passed.obs[-1]))
+    def one(streams: Streams, keys: Array) -> tuple[Streams, Any]:
+        streams, passed, _ = segment(
+            agent, env, state, roadmap, streams, env_steps=None, record=record, keys=(keys[0], keys[1], keys[2])
+        )
+        memory = hierarchy.onward(agent, roadmap, streams.memory, passed.obs[-1])
         return streams.replace(memory=memory), passed.recorded
 
-    streams, recorded = jax.lax.scan(one, streams, jax.random.split(scan_key, segments))
+    streams, recorded = jax.lax.scan(one, streams, keys)
     return streams, jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), recorded)
 
 
@@ -141,34 +139,26 @@ def segment(
     *,
     env_steps: Float[Array, ""] | None,
     record: Record | None = None,
-    keys: tuple[Array, Array, Array],
+    keys: Keys,
 ) -> tuple[Streams, Segment, Marks]:
     """Command where a period begins, choose a subgoal, act for l env steps; and what SGIM had to say.
 
     `env_steps` are those of all environments before the epoch, None in greedy episodes. `keys` are three: of Commander,
     Tutor and Controller.
     """
-    config, task = agent.config, agent.task
-    obs, success = streams.env.obs, streams.env.metrics["success"]
-    scene = Scene(task.spec.abstract(obs), task.spec.goal_point(obs), success)
-    lesson, marks = agent.guide.mark(
-        config.sgim, streams.lesson, roadmap.abstraction, scene.position, due=streams.memory.clock == 0
-    )
-    memory = agent.commander.command(
-        config.commander,
-        task,
-        state.commander,
+    memory, lesson, marks, choice = hierarchy.decide(
+        agent,
+        state,
         roadmap,
         streams.memory,
-        scene,
-        marks,
+        streams.lesson,
+        streams.env.obs,
+        streams.env.metrics["success"],
         env_steps=env_steps,
-        key=keys[0],
+        keys=keys,
     )
-    explore = env_steps is not None
-    draw = explore | agent.commander.in_vain(memory, success)
-    choice = agent.tutor.act(config.tutor, task, state.tutor, obs, memory.box, marks, draw=draw, key=keys[1])
     streams = streams.replace(memory=memory, lesson=lesson)
+    explore = env_steps is not None
     streams, passed = rollout(agent, env, state, streams, choice, explore=explore, record=record, key=keys[2])
     return streams, passed, marks
 
@@ -185,34 +175,30 @@ def rollout(
     key: Array,
 ) -> tuple[Streams, Segment]:
     """L env steps under one subgoal per environment. Environments that end stay as they are in the statistics."""
-    spec, subgoals, controller = agent.task.spec, agent.task.subgoals, agent.controller
-    section, box = agent.config.controller, streams.memory.box
-
-    def observe(env_state: EnvState, subgoal: Array) -> Array:
-        return controller.observe(section, agent.task, spec.state(env_state.obs), subgoal)
+    length, box = agent.task.spec.episode_length, streams.memory.box
 
     def step(carry: tuple, step_key: Array) -> tuple[tuple, tuple[dict[str, Any], dict[str, Array]]]:
         before, subgoal, seen, alive, episode = carry
-        action = controller.act(section, state.controller, seen, explore=explore, key=step_key)
+        action = hierarchy.act(agent, state, seen, explore=explore, key=step_key)
         recorded = record(before, subgoal, box, action) if record else None
         after = env.step(before, action)
-        moved = subgoals.moved(subgoal, spec.pose(before.obs), spec.pose(after.obs))
+        moved = hierarchy.follow(agent, subgoal, before.obs, after.obs)
         steps = {
             "action": action,
             "success": after.metrics["success"],
             "distance": after.metrics["distance"],
             "terminated": after.done * (1 - after.info["truncation"]),
-            "ended": after.done * (after.info["steps"] < spec.episode_length),
+            "ended": after.done * (after.info["steps"] < length),
             "alive": alive,
             "non_finite": after.metrics["non_finite"],
             "overflow": after.metrics["overflow"],
             "recorded": recorded,
         }
-        seen = observe(after, moved)
+        seen = hierarchy.observe(agent, after.obs, moved)
         ends = {"obs": after.obs, "subgoal": moved, "seen": seen}
         return (after, moved, seen, alive * (1 - after.done), episode.after(after, alive)), (steps, ends)
 
-    seen = observe(streams.env, choice.subgoal)
+    seen = hierarchy.observe(agent, streams.env.obs, choice.subgoal)
     carry = (streams.env, choice.subgoal, seen, 1 - streams.env.done, streams.episode)
     (env_state, _, _, _, episode), (steps, ends) = jax.lax.scan(
         step, carry, jax.random.split(key, agent.config.tutor.period)

@@ -8,7 +8,8 @@ from typing import Any
 
 from rich.console import Console
 
-from star.cli.words import count, given_back, new_place
+from envs.common.files import given_back, new_place
+from star.cli.words import count
 from star.config import plugins
 
 HELP = "try many settings"

@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from star.cli.words import count, given_back, new_place
+from envs.common.files import given_back, new_place
+from star.cli.words import count
 from star.config import kinds, plugins
 from star.config.loading import load, load_run, parse
 from star.config.run import RunConfig

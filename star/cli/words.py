@@ -1,20 +1,15 @@
-"""The words of a command line: numbers, settings with dots, and places for what is written."""
+"""The words of a command line: numbers, and settings with dots."""
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from datetime import datetime
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import yaml
 
-from envs.common import files, reading
-from envs.common.errors import UserError
+from envs.common import reading
 from star.config.section import ConfigError
 
 _SETTING = re.compile(r"[A-Za-z_]\w*(\.\w+)+=")  # at the beginning of a word; a path would have a /
@@ -49,34 +44,6 @@ def value(text: str) -> Any:
     except yaml.YAMLError:
         return text
     return text if isinstance(read, str) and "\n" in text else read  # YAML would fold the lines of a map
-
-
-def new_place(folder: Path, name: str) -> Path:
-    """A new place in `folder`, named after the time. It is made at once, so that no other command takes it."""
-    first = folder / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
-    places = itertools.chain([first], (first.with_name(f"{first.name}-{number}") for number in itertools.count(2)))
-    for place in places:
-        try:
-            files.check_name(place)
-            place.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise ConfigError(f"{place}: cannot be written: {error.strerror}") from None
-        return place
-    raise AssertionError
-
-
-@contextmanager
-def given_back(place: Path) -> Iterator[None]:
-    """If what is done here is refused, remove the new `place` for it, and the folder around, as far as empty."""
-    try:
-        yield
-    except UserError:
-        with suppress(OSError):
-            place.rmdir()
-            place.parent.rmdir()
-        raise
 
 
 def natural(text: str) -> int:

@@ -108,7 +108,8 @@ class Kind(NamedTuple):
     anywhere: Mapping[str, Any] = {}
     """Settings of agents that act on another machine than that of their training."""
     commands: Mapping[str, Callable[..., Any]] = {}
-    """Its own `evaluate`, `render`, `record`, `envs`; and `map`, what the report draws of its tables."""
+    """Its own `evaluate`, `render`, `record`, `envs`; `map`, what the report draws of its tables; and, for programs,
+    `measure`, the rows of `star.evaluate`, and `load`, the agent of `star.load`."""
 
     def readable(self, number: Any) -> bool:
         """Whether checkpoints of the format `number` can be read."""

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 import yaml
 
+import star
+from envs.common.errors import UserError
 from star.cli import main
 from star.config import kinds
 from star.config.kinds import Measure
@@ -108,6 +110,16 @@ def test_what_to_type_next_lets_its_module_in_and_can_be_pasted(here, capsys, mo
     monkeypatch.setenv("STAR_IMPORT", "")
     sys.modules.pop("bandit")
     assert main(shlex.split(told.removeprefix("next:"))[1:]) == 0
+
+
+def test_programs_measure_it_and_are_told_that_it_has_no_agent(here, capsys):
+    result = star.train("run.yaml", {"trainer.total_env_steps": 200}, run_dir="run")
+    row = star.evaluate("run", seed=2)
+    assert row["env_steps"] == result["env_steps"] == 200 and result["pay"] is not None
+    assert main(["evaluate", "run", "--json", "--evaluation-seed", "2"]) == 0
+    assert json.loads(capsys.readouterr().out) == row
+    with pytest.raises(UserError, match="^run: is a run of experiment bandit:KIND, which has no agent that acts$"):
+        star.load("run")
 
 
 def test_the_other_commands_work_on_it(here, capsys):

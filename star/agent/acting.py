@@ -1,0 +1,242 @@
+"""A trained agent that acts from observations: the greedy agent of `star evaluate`, moved by whoever has the body.
+
+It calls the functions of `hierarchy` that greedy episodes of `play` consist of, so that on a CPU the same observations
+lead to the same actions, bit for bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from envs.common.errors import UserError
+from star.agent import commands, hierarchy, levels
+from star.agent.decisions import Memory, Roadmap
+from star.agent.sections import AgentConfig, Config
+from star.agent.state import TrainState
+from star.config.loading import load_to_act
+from star.spec import Spec
+from star.training import checkpoint as saved
+from star.training import program as programs
+from star.training.program import Program
+
+_DICT = ("observation", "desired_goal")  # of what Gymnasium's environments show, what an agent sees
+
+
+class Regions(NamedTuple):
+    """The n regions of an agent: boxes [lower, upper), in units of the state. There are none without a Commander."""
+
+    lower: Float[np.ndarray, "n d"]
+    upper: Float[np.ndarray, "n d"]
+
+
+class _Functions(NamedTuple):
+    """The jitted functions of an agent. Settings and state come first."""
+
+    begin: Callable[..., tuple[TrainState, Roadmap, Memory, Array]]
+    decide: Callable[..., tuple[Memory, Array, Array]]
+    go_on: Callable[..., tuple[Array, Array]]
+    onward: Callable[..., Memory]
+
+    @classmethod
+    def of(cls, spec: Spec) -> _Functions:
+        return cls(*(jax.jit(partial(function, spec)) for function in (_begin, _decide, _go_on, _onward)))
+
+
+@dataclass
+class _Episode:
+    """Where the hierarchy stands in the episodes of B bodies, after `steps` env steps. `before` is the last `obs`."""
+
+    state: TrainState
+    roadmap: Roadmap
+    memory: Memory
+    keys: Array
+    subgoal: Any = None
+    before: Any = None
+    steps: int = 0
+
+
+class TrainedAgent:
+    """The greedy agent of one seed of a run; see `star.load`."""
+
+    def __init__(self, program: Program, state: TrainState, *, run_dir: Path, env_steps: int, seed: int) -> None:
+        self._program, self._state, self._run_dir = program, state, run_dir
+        self.env_steps = env_steps
+        """Those of its checkpoint."""
+        self.seed = seed
+        """The one that it was trained with."""
+        self.spec: Spec = program.experiment.tested_spec
+        """What it knows of the task: sizes, and which entries of the state positions and goals are."""
+        self._functions = _Functions.of(self.spec)
+        self._episode: _Episode | None = None
+        self.reset()
+
+    @property
+    def config(self) -> Config:
+        """The settings of its run."""
+        return self._program.config
+
+    @property
+    def observation_size(self) -> int:
+        """Length n of an observation: the state, then the goal."""
+        return self.spec.state_dim + len(self.spec.goal_indices)
+
+    @property
+    def action_size(self) -> int:
+        """Length of an action."""
+        return self.spec.action_size
+
+    @property
+    def regions(self) -> Regions:
+        """The regions that its Commander chooses from."""
+        found, count = self._state.abstraction, int(self._state.abstraction.count)
+        count *= self.config.commander.enabled
+        return Regions(np.asarray(found.lower[:count]), np.asarray(found.upper[:count]))
+
+    def reset(self, seed: int = 0) -> None:
+        """Begin an episode with the next observation.
+
+        `seed` is the `--evaluation-seed` of `star evaluate`: it decides between commands of equal worth, and where the
+        Tutor goes after a command that was in vain.
+        """
+        keys = self._program.evaluation_keys(seed, stream=programs.AFTERWARDS)
+        self._key, self._episode = keys[self._program.seeds.index(self.seed)], None
+
+    def act(self, obs: Any) -> Float[np.ndarray, "*batch act"]:
+        """The action for an observation [n], or the actions for those [B, n] of B bodies; in [-1, 1].
+
+        `obs` may be what Gymnasium's environments show, too: a mapping with `observation` and `desired_goal`. The
+        agent remembers the episode: call it once an env step, and `reset` before the next episode. All bodies of a
+        batch begin together, and it acts as in `star evaluate --episodes B`.
+
+        Raises:
+          UserError: in one line, for another shape, what is not finite, or after the last env step of the episode.
+        """
+        given = _as_array(obs, self.observation_size)
+        batch = given.reshape(-1, self.observation_size)
+        episode = self._episode = self._episode or self._begun(batch)
+        self._check(episode, batch)
+        segment, within = divmod(episode.steps, self.config.tutor.period)
+        hyper, functions = self._program.hyper, self._functions
+        if within == 0:
+            if segment:
+                episode.memory = functions.onward(hyper, episode.roadmap, episode.memory, batch)
+            episode.memory, episode.subgoal, action = functions.decide(
+                hyper, episode.state, episode.roadmap, episode.memory, batch, episode.keys[segment]
+            )
+        else:
+            episode.subgoal, action = functions.go_on(hyper, episode.state, episode.subgoal, episode.before, batch)
+        episode.before, episode.steps = batch, episode.steps + 1
+        return np.clip(np.asarray(action), -1.0, 1.0).reshape(*given.shape[:-1], self.action_size)
+
+    def render(self, path: str | Path, *, force: bool = False, **how: Any) -> str:
+        """Write a picture or a film of a test episode, and return a line about it; the ending of `path` decides.
+
+        `how` are fields of `star.agent.films.Show`, as `steps`, `every`, `fps`, `camera` and `height`. Begins no
+        episode of `act`. Raises `UserError` in one line if it cannot be drawn.
+        """
+        from star.agent import films  # drawing needs OpenGL, acting does not
+
+        commands.check_output(Path(path), force=force)
+        show = films.Show(out=Path(path), **how)
+        return films.render(
+            self.config,
+            show,
+            run_dir=self._run_dir,
+            checkpoint=str(self.env_steps),
+            agent=self.seed,
+            quiet=True,
+        )
+
+    def _begun(self, obs: Float[np.ndarray, "B n"]) -> _Episode:
+        return _Episode(*self._functions.begin(self._program.hyper, self._state, obs, self._key))
+
+    def _check(self, episode: _Episode, obs: np.ndarray) -> None:
+        """Raise `UserError` for another number of bodies, or after the end of the episode."""
+        bodies = len(episode.memory.clock)
+        if len(obs) != bodies:
+            raise UserError(f"obs: of {len(obs)}, but the episode began with {bodies}; agent.reset() begins another")
+        if episode.steps == self.spec.episode_length:
+            raise UserError(f"obs: the episode of {episode.steps} env steps is over; agent.reset() begins another")
+
+
+def load(run_dir: Path, *, checkpoint: str = "last", seed: int | None = None) -> TrainedAgent:
+    """The agent of `seed` (None: the first) in a checkpoint of a run; raises `UserError`, as `star.load` does."""
+    program = programs.build(load_to_act(run_dir, {}))
+    number = saved.agent_number(program, run_dir, seed)
+    env_steps, states = saved.load_state(program, run_dir, checkpoint)
+    state = jax.tree.map(lambda leaf: leaf[number], states)
+    return TrainedAgent(program, state, run_dir=run_dir, env_steps=env_steps, seed=program.seeds[number])
+
+
+def _begin(
+    spec: Spec, config: AgentConfig, state: TrainState, obs: Float[Array, "B n"], key: Array
+) -> tuple[TrainState, Roadmap, Memory, Array]:
+    """The state as it acts, its roadmap, the memory at the start, and the keys of all segments."""
+    agent, segments = levels.of(config, spec, greedy=True), spec.episode_length // config.tutor.period
+    begin_key, keys = hierarchy.segment_keys(key, segments)
+    memory = agent.commander.begin(config.commander, spec.abstract(obs), decisions=segments, key=begin_key)
+    return *hierarchy.prepare(agent, state), memory, keys
+
+
+def _decide(
+    spec: Spec,
+    config: AgentConfig,
+    state: TrainState,
+    roadmap: Roadmap,
+    memory: Memory,
+    obs: Float[Array, "B n"],
+    keys: Float[Array, "3"],
+) -> tuple[Memory, Array, Array]:
+    """The first env step of a segment: memory, subgoal and action."""
+    agent = levels.of(config, spec, greedy=True)
+    memory, _, _, choice = hierarchy.decide(
+        agent, state, roadmap, memory, (), obs, spec.success(obs), env_steps=None, keys=(keys[0], keys[1], keys[2])
+    )
+    seen = hierarchy.observe(agent, obs, choice.subgoal)
+    return memory, choice.subgoal, hierarchy.act(agent, state, seen, explore=False, key=keys[2])
+
+
+def _go_on(
+    spec: Spec, config: AgentConfig, state: TrainState, subgoal: Array, before: Array, obs: Array
+) -> tuple[Array, Array]:
+    """Any other env step: subgoal and action."""
+    agent = levels.of(config, spec, greedy=True)
+    subgoal = hierarchy.follow(agent, subgoal, before, obs)
+    seen = hierarchy.observe(agent, obs, subgoal)
+    return subgoal, hierarchy.act(agent, state, seen, explore=False, key=state.key)
+
+
+def _onward(spec: Spec, config: AgentConfig, roadmap: Roadmap, memory: Memory, obs: Array) -> Memory:
+    """The memory after a segment."""
+    return hierarchy.onward(levels.of(config, spec, greedy=True), roadmap, memory, obs)
+
+
+def _as_array(obs: Any, size: int) -> Float[np.ndarray, "*batch n"]:
+    """`obs` as one float32 array, if that is what an agent can see; raises `UserError`."""
+    if isinstance(obs, Mapping):
+        for name in _DICT:
+            if name not in obs:
+                raise UserError(f"obs: has no {name!r}; allowed: an array, or a mapping with {' and '.join(_DICT)}")
+        parts = [obs[name] for name in _DICT]
+    else:
+        parts = [obs]
+    try:
+        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite, which is told below
+            found = np.concatenate([np.asarray(part, np.float32) for part in parts], axis=-1)
+    except (TypeError, ValueError):
+        raise UserError(f"obs: is no array of numbers; allowed: shape ({size},) or (B, {size})") from None
+    if found.ndim not in (1, 2) or found.shape[-1] != size or not found.size:
+        raise UserError(f"obs: its shape is {found.shape}; allowed: ({size},) or (B, {size}), the state, then the goal")
+    wrong = np.argwhere(~np.isfinite(found))
+    if len(wrong):
+        place = ", ".join(map(str, wrong[0]))
+        raise UserError(f"obs: entry [{place}] is {found[tuple(wrong[0])]}; allowed: finite numbers")
+    return found

@@ -1,0 +1,92 @@
+"""One env step of the hierarchy, whoever moves the body: `play` in simulated environments, `acting` from observations.
+
+prepare   before a greedy episode: the Commander as it acts there, and its roadmap
+decide    every l env steps: the Commander's target where a period begins, and the Tutor's subgoal
+follow    after every env step: the subgoal moves with the agent
+act       at every env step: the Controller
+onward    after a greedy segment of l env steps: the clocks move on
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+from jaxtyping import Array, Float
+
+from star.agent.decisions import Memory, Roadmap, Scene
+from star.agent.levels import Agent
+from star.agent.segments import Choice
+from star.agent.state import TrainState
+from star.sgim.lessons import Marks
+
+Keys = tuple[Array, Array, Array]
+"""Those of Commander, Tutor and Controller in one segment."""
+
+
+def prepare(agent: Agent, state: TrainState) -> tuple[TrainState, Roadmap]:
+    """The state as greedy episodes act on it, and what its Commander chooses from."""
+    section, length = agent.config.commander, agent.task.spec.episode_length
+    roadmap = Roadmap.of(section, state.abstraction, state.graph)
+    settled = agent.commander.settle(section, state.commander, roadmap, episode_length=length)
+    return state.replace(commander=settled), roadmap
+
+
+def segment_keys(key: Array, segments: int) -> tuple[Array, Array]:
+    """From the key of a greedy episode: the one that begins it, and those of its segments [segments, 3]."""
+    begin_key, scan_key = jax.random.split(key)
+    return begin_key, jax.vmap(lambda one: jax.random.split(one, 3))(jax.random.split(scan_key, segments))
+
+
+def decide(
+    agent: Agent,
+    state: TrainState,
+    roadmap: Roadmap,
+    memory: Memory,
+    lesson: Any,
+    obs: Float[Array, "B obs"],
+    success: Float[Array, "B"],
+    *,
+    env_steps: Float[Array, ""] | None,
+    keys: Keys,
+) -> tuple[Memory, Any, Marks, Choice]:
+    """Command where a period begins, and choose a subgoal; with what SGIM had to say, and its lesson after that.
+
+    `success` is 1 where the goal counts as reached; `env_steps` are as for `play.segment`.
+    """
+    config, task = agent.config, agent.task
+    scene = Scene(task.spec.abstract(obs), task.spec.goal_point(obs), success)
+    lesson, marks = agent.guide.mark(config.sgim, lesson, roadmap.abstraction, scene.position, due=memory.clock == 0)
+    memory = agent.commander.command(
+        config.commander, task, state.commander, roadmap, memory, scene, marks, env_steps=env_steps, key=keys[0]
+    )
+    draw = (env_steps is not None) | agent.commander.in_vain(memory, success)
+    choice = agent.tutor.act(config.tutor, task, state.tutor, obs, memory.box, marks, draw=draw, key=keys[1])
+    return memory, lesson, marks, choice
+
+
+def observe(agent: Agent, obs: Float[Array, "B obs"], subgoal: Float[Array, "B m"]) -> Float[Array, "B seen"]:
+    """What the Controller sees."""
+    return agent.controller.observe(agent.config.controller, agent.task, agent.task.spec.state(obs), subgoal)
+
+
+def follow(
+    agent: Agent, subgoal: Float[Array, "B m"], before: Float[Array, "B obs"], after: Float[Array, "B obs"]
+) -> Float[Array, "B m"]:
+    """The subgoal after an env step that led from the observation `before` to `after`."""
+    spec = agent.task.spec
+    return agent.task.subgoals.moved(subgoal, spec.pose(before), spec.pose(after))
+
+
+def act(
+    agent: Agent, state: TrainState, seen: Float[Array, "B seen"], *, explore: bool, key: Array
+) -> Float[Array, "B act"]:
+    """The Controller's actions."""
+    return agent.controller.act(agent.config.controller, state.controller, seen, explore=explore, key=key)
+
+
+def onward(agent: Agent, roadmap: Roadmap, memory: Memory, obs: Float[Array, "B obs"]) -> Memory:
+    """The Commander's memory after a greedy segment that ended in `obs`."""
+    section = agent.config.commander
+    memory = agent.commander.tick(section, memory, steps=agent.config.tutor.period)
+    return agent.commander.ahead_of_time(section, roadmap, memory, agent.task.spec.abstract(obs))
