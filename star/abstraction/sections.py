@@ -6,65 +6,82 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from star.config.section import Batch, Hidden, Positive, Repeats, Section
+from star.config.section import Batch, Hidden, Positive, Repeats, Section, setting
 from star.learners.sections import BufferedConfig
 
 
 class AbstractionConfig(Section):
     """The regions the Commander chooses from."""
 
-    max_regions: Annotated[int, Field(ge=1, le=1024)] = Field(64, description="capacity of the table of regions")
-    cuts: tuple[tuple[float, ...], ...] | None = Field(
-        None, description="initial cut positions per abstract dimension; by default those of the task"
+    max_regions: Annotated[int, Field(ge=1, le=1024)] = setting(
+        64, "The table of regions has room for so many.", unit="regions"
     )
-    grid: tuple[Positive, ...] | None = Field(
-        None, description="instead of cuts: equal initial parts along each abstract dimension, 1 where left out"
+    cuts: tuple[tuple[float, ...], ...] | None = setting(
+        None,
+        "The space is cut here at first, along each abstract dimension; with null as the task says.",
+        unit="units of the state",
+        allowed="inside the space of the task",
     )
-    min_width: float = Field(1.0, gt=0, description="no region is cut narrower than this (units of the state)")
-    min_share: float = Field(
-        0.0, ge=0, description="no region is cut below this times the space over the regions left; 0: any"
+    grid: tuple[Positive, ...] | None = setting(
+        None,
+        "Instead of cuts: the space has so many equal parts along each dimension at first, 1 where left out.",
+        unit="regions",
+    )
+    min_width: float = setting(1.0, "No region is cut narrower than this.", unit="units of the state", gt=0)
+    min_share: float = setting(
+        0.0, "No region is cut below this times the space over the regions left.", unit="", ge=0
     )
 
 
 class ForwardModelConfig(BufferedConfig):
     """F_k: predicts where k steps under a commanded region lead."""
 
-    hidden: Hidden = Field((32, 32), description="widths of the ReLU layers")
-    learning_rate: float = Field(1e-3, gt=0, description="Adam step size")
-    batch_size: Batch = Field(512, description="transitions per update")
-    buffer_size: Positive = Field(100_000, description="transitions kept")
-    updates_per_epoch: Repeats = Field(200, description="gradient updates after each epoch")
-    residual: bool = Field(True, description="predict the displacement instead of the final state")
-    boxes: Literal["commanded", "reached"] = Field(
-        "commanded", description="train on the box that was commanded, or on the region that was reached"
+    hidden: Hidden = setting((32, 32), "The model has ReLU layers of these widths.", unit="units")
+    learning_rate: float = setting(1e-3, "Adam takes steps of this size.", unit="", gt=0)
+    batch_size: Batch = setting(512, "Each update learns from so many transitions.", unit="transitions")
+    buffer_size: Positive = setting(100_000, "The buffer keeps so many transitions.", unit="transitions")
+    updates_per_epoch: Repeats = setting(
+        200, "The model makes so many gradient updates after each epoch.", unit="updates"
+    )
+    residual: bool = setting(True, "The model predicts the displacement, not the final state.")
+    boxes: Literal["commanded", "reached"] = setting(
+        "commanded", "The model trains on the box that was commanded, or on the region that was reached."
     )
 
 
 class RefinementConfig(Section):
     """When and where a region is split."""
 
-    enabled: bool = Field(True, description="false keeps the initial regions")
-    within: bool = Field(True, description="examine too whether a region reaches the goals inside it")
-    neighbours: bool = Field(
-        True, description="cut a region only for targets that touch it; others are reached by way of these"
+    enabled: bool = setting(True, "With false the initial regions stay.")
+    within: bool = setting(True, "Whether a region reaches the goals inside it is examined, too.")
+    neighbours: bool = setting(
+        True, "A region is cut only for targets that touch it; others are reached by way of these."
     )
-    min_transitions: Positive = Field(100, description="commanded transitions before a pair is examined")
-    error_tolerance: float = Field(
-        0.5, ge=0, description="the model's error on a pair is stable once it falls by less than this share an epoch"
+    min_transitions: Positive = setting(
+        100, "A pair of regions is examined after so many commanded transitions.", unit="transitions"
     )
-    reach_share: float = Field(0.7, gt=0, le=1, description="c1: share of the hull inside the target that reaches")
-    miss_share: float = Field(0.1, ge=0, lt=1, description="tau2: share of the target covered below which a box misses")
-    depth: Annotated[int, Field(ge=1, le=12)] = Field(
-        8, description="boxes are halved this often at most: 5 makes 1/32 of the region"
+    error_tolerance: float = setting(
+        0.5, "The model's error on a pair is stable once it falls by less than this share an epoch.", unit="", ge=0
     )
-    parts: Annotated[int, Field(ge=2, le=4096)] = Field(
-        32, description="parts of a region at most; each round of halving begins with those visited most"
+    reach_share: float = setting(
+        0.7, "A box reaches its target if this share of its hull lies inside (c1).", unit="", gt=0, le=1
     )
-    min_visits: Positive = Field(10, description="visited start states a reaching box needs")
-    pairs_per_epoch: Repeats = Field(16, description="pairs examined after each epoch")
-    cuts: Literal["best", "random"] = Field("best", description="where a region is cut; random is for comparison")
-    cuts_per_pair: Repeats = Field(1, description="cuts one examined pair may make")
-    separate: bool = Field(True, description="cut a region too along a plane that agents do not pass")
-    miss_lifetime: Annotated[int, Field(ge=0, lt=2**31)] = Field(
-        2, description="a MISSES verdict older than so many epochs is forgotten; with 0 there is none"
+    miss_share: float = setting(
+        0.1, "A box misses its target if it covers less than this share of it (tau2).", unit="", ge=0, lt=1
+    )
+    depth: Annotated[int, Field(ge=1, le=12)] = setting(
+        8, "Boxes are halved so often at most: 5 makes 1/32 of the region.", unit="halvings"
+    )
+    parts: Annotated[int, Field(ge=2, le=4096)] = setting(
+        32, "A region has so many parts at most; those visited most are halved first.", unit="parts"
+    )
+    min_visits: Positive = setting(10, "A reaching box needs so many visited start states.", unit="states")
+    pairs_per_epoch: Repeats = setting(16, "So many pairs of regions are examined after each epoch.", unit="pairs")
+    cuts: Literal["best", "random"] = setting(
+        "best", "A region is cut at the best place, or for comparison at a random one."
+    )
+    cuts_per_pair: Repeats = setting(1, "One examined pair makes so many cuts at most.", unit="cuts")
+    separate: bool = setting(True, "A region is cut along a plane that agents do not pass, too.")
+    miss_lifetime: Annotated[int, Field(ge=0, lt=2**31)] = setting(
+        2, "A verdict that a pair misses is forgotten after so many epochs; with 0 there is none.", unit="epochs"
     )

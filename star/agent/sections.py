@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from star.abstraction.sections import AbstractionConfig, ForwardModelConfig, RefinementConfig
 from star.config.run import EnvConfig, RunConfig, TrainerConfig
-from star.config.section import Batch, Hidden, Positive, Repeats, Section
+from star.config.section import Batch, Hidden, Positive, Repeats, Section, setting
 from star.learners import Rollout
 from star.learners.sections import LevelConfig
 from star.sgim.sections import SgimConfig
@@ -18,94 +18,120 @@ from star.sgim.sections import SgimConfig
 class CommanderConfig(Section):
     """The Commander: a table of values over regions."""
 
-    enabled: bool = Field(True, description="false commands the goal itself all the time, as in HIRO")
-    learner: Literal["model", "q"] = Field("model", description="planning on a learnt model of regions, or Q-learning")
-    period: Positive = Field(30, description="k: env steps between the Commander's decisions")
-    learning_rate: float = Field(
-        0.01, gt=0, le=1, description="alpha of learner q, applied once per stream and visited cell"
+    enabled: bool = setting(True, "With false the goal itself is commanded all the time, as in HIRO.")
+    learner: Literal["model", "q"] = setting(
+        "model", "The Commander plans on a learnt model of regions, or learns by Q-learning."
     )
-    discount: float = Field(0.95, ge=0, lt=1, description="gamma per decision")
-    epsilon_start: float = Field(0.5, ge=0, le=1, description="share of random targets at the start")
-    epsilon_end: float = Field(0.1, ge=0, le=1, description="share of random targets after epsilon_steps")
-    epsilon_steps: float = Field(1e6, gt=0, description="env steps over which epsilon falls linearly")
-    epsilon_spread: bool = Field(
-        True, description="spread epsilon over the environments, from none to twice as much, instead of the same in all"
+    period: Positive = setting(30, "The Commander decides once in so many env steps (k).", unit="env steps")
+    learning_rate: float = setting(
+        0.01,
+        "Learner q moves a value by this share of its error, once per stream and visited cell (alpha).",
+        unit="",
+        gt=0,
+        le=1,
     )
-    arrival: bool = Field(
-        True, description="greedy episodes: decide again as soon as the target region is reached, not after k env steps"
+    discount: float = setting(
+        0.95, "A reward counts by this factor less for each decision that it lies ahead (gamma).", unit="", ge=0, lt=1
     )
-    retry: float = Field(
-        0.9, ge=0, le=1, description="greedy episodes: what a command is worth where it was given before and led back"
+    epsilon_start: float = setting(0.5, "This share of targets is random at the start.", unit="", ge=0, le=1)
+    epsilon_end: float = setting(0.1, "This share of targets is random after epsilon_steps.", unit="", ge=0, le=1)
+    epsilon_steps: float = setting(
+        1e6, "The share of random targets falls linearly over so many env steps.", unit="env steps", gt=0
     )
-    trust: float = Field(
+    epsilon_spread: bool = setting(
+        True, "True spreads the share of random targets over the environments, from none to twice as much."
+    )
+    arrival: bool = setting(
+        True, "In greedy episodes the Commander decides again as soon as the target region is reached."
+    )
+    retry: float = setting(
+        0.9, "In greedy episodes a command that led back before is worth this share of its value.", unit="", ge=0, le=1
+    )
+    trust: float = setting(
         0.99,
+        "In greedy episodes a command that has led nowhere yet works with this chance; with 1 there are no doubts.",
+        unit="",
         ge=0,
         le=1,
-        description="greedy episodes: chance that a command works which has led nowhere yet; 1: no doubts",
     )
-    hold: Literal[False, True, "region"] = Field(
-        True,
-        description="command the goal wherever it counts as reached (true), or instead all over its region (region)",
+    hold: Literal[False, True, "region"] = setting(
+        True, "The goal is commanded wherever it counts as reached (true), or all over its region (region)."
     )
-    practice: float = Field(
-        0.25, ge=0, le=1, description="share of environments that practise reaching random regions, one after another"
+    practice: float = setting(
+        0.25, "This share of environments practises reaching random regions, one after another.", unit="", ge=0, le=1
     )
-    successors: Literal["all", "any", "possible", "known"] = Field(
+    successors: Literal["all", "any", "possible", "known"] = setting(
         "any",
-        description="greedy choice among all targets, those not shown unreachable, or the known-reachable ones, which "
-        "known keeps to in random choices too; all disregards reachability in those and in plans",
+        "Greedy targets are any, those not shown unreachable (possible), or those shown reachable (known); "
+        "all ignores reachability in plans too.",
     )
-    reward: Literal["success", "mean", "max"] = Field(
-        "success",
-        description="of a decision: mean success of its k env steps, or mean or maximum of r_ext",
+    reward: Literal["success", "mean", "max"] = setting(
+        "success", "A decision earns the mean success of its k env steps, or the mean or maximum of the task's reward."
     )
-    sweeps: Repeats = Field(10, description="sweeps of value iteration of learner model after every k env steps")
-    prior: float = Field(
+    sweeps: Repeats = setting(
+        10, "Learner model makes so many sweeps of value iteration after every k env steps.", unit="sweeps"
+    )
+    prior: float = setting(
         5.0,
+        "The belief in what was not tried weighs as much as so many decisions; it fades as it is tried.",
+        unit="decisions",
         gt=0,
-        description="decisions that weigh as much as the belief in what was not tried; it fades as it is tried",
     )
-    memory: float = Field(
-        0.5, ge=0, le=1, description="share of old decisions left in the model an epoch later; 20 of each command stay"
+    memory: float = setting(
+        0.5,
+        "This share of old decisions is left in the model an epoch later; 20 of each command stay.",
+        unit="",
+        ge=0,
+        le=1,
     )
-    goal_margin: float = Field(
+    goal_margin: float = setting(
         1.0,
+        "The box around a goal has at most this half-width; it always fits into the ball of success.",
+        unit="units of the state",
         gt=0,
-        description="largest half-width of the box around g* given to the Tutor in its region, which is never more "
-        "than fits into the ball of success",
     )
 
 
 class AdjacencyConfig(Section):
     """The adjacency network of HRAC, which keeps the Tutor from subgoals out of reach."""
 
-    enabled: bool = Field(False, description="true penalises subgoals that are not adjacent, as in HRAC")
-    weight: float = Field(20.0, ge=0, description="of the penalty in the loss of the Tutor's actor")
-    cell: Positive = Field(1, description="side of the cells that states are rounded to (units of the state)")
-    hidden: Hidden = Field((128, 128, 128), description="widths of the ReLU layers")
-    features: Annotated[int, Field(gt=0, le=2**14)] = Field(32, description="size of the embedding")
-    learning_rate: float = Field(2e-4, gt=0, description="Adam step size")
-    near: float = Field(1.0, gt=0, description="adjacent cells are to be no further apart in the embedding")
-    far: float = Field(1.2, gt=0, description="other cells are to be no closer in the embedding")
-    limit: float = Field(1.1, gt=0, description="subgoals no further than this cost nothing")
-    batch_size: Batch = Field(512, description="anchors per update")
-    updates_per_epoch: Repeats = Field(200, description="gradient updates after each epoch")
+    enabled: bool = setting(False, "True penalises subgoals that are not adjacent, as in HRAC.")
+    weight: float = setting(20.0, "The penalty has this weight in the loss of the Tutor's actor.", unit="", ge=0)
+    cell: Positive = setting(1, "States are rounded to cells with sides of this length.", unit="units of the state")
+    hidden: Hidden = setting((128, 128, 128), "The network has ReLU layers of these widths.", unit="units")
+    features: Annotated[int, Field(gt=0, le=2**14)] = setting(
+        32, "The embedding of a state has so many numbers.", unit="numbers"
+    )
+    learning_rate: float = setting(2e-4, "Adam takes steps of this size.", unit="", gt=0)
+    near: float = setting(1.0, "Adjacent cells are to be no further apart in the embedding.", unit="", gt=0)
+    far: float = setting(1.2, "Other cells are to be no closer in the embedding.", unit="", gt=0)
+    limit: float = setting(1.1, "Subgoals no further than this in the embedding cost nothing.", unit="", gt=0)
+    batch_size: Batch = setting(512, "Each update learns from so many anchors.", unit="states")
+    updates_per_epoch: Repeats = setting(
+        200, "The network makes so many gradient updates after each epoch.", unit="updates"
+    )
 
 
 class TutorConfig(LevelConfig):
     """The Tutor: chooses the subgoal on the way to the target region."""
 
-    enabled: bool = Field(True, description="false gives the target box to the Controller itself, as in GARA")
-    period: Positive = Field(10, description="l: env steps between the Tutor's decisions")
-    heading: float | None = Field(
-        None, gt=0, description="m: subgoals also say where to face, by a vector of this length"
+    enabled: bool = setting(True, "With false the Controller is given the target box itself, as in GARA.")
+    period: Positive = setting(10, "The Tutor decides once in so many env steps (l).", unit="env steps")
+    heading: float | None = setting(
+        None, "Subgoals also say where to face, by a vector of this length; with null they do not.", unit="m", gt=0
     )
-    unroll: Positive = Field(5, description="decisions of each environment per update")
-    reward_scale: float = Field(0.3, gt=0, description="factor on the reward")
-    straight: bool = Field(True, description="aim straight at the box around a goal within half the reach of a subgoal")
-    relative_bounds: bool = Field(True, description="observe the region's bounds relative to the agent")
-    off_policy_correction: bool = Field(False, description="relabel replayed subgoals (HIRO); needs learner td3")
-    correction_candidates: Batch = Field(10, description="random candidates of the off-policy correction")
+    unroll: Positive = setting(5, "Each update learns from so many decisions of each environment.", unit="decisions")
+    reward_scale: float = setting(0.3, "The reward is multiplied by this.", unit="", gt=0)
+    straight: bool = setting(
+        True, "The Tutor aims straight at the box around a goal within half the reach of a subgoal."
+    )
+    relative_bounds: bool = setting(True, "The Tutor sees the region's bounds relative to the agent.")
+    off_policy_correction: bool = setting(
+        False, "Replayed subgoals are relabelled, as in HIRO; this needs learner td3."
+    )
+    correction_candidates: Batch = setting(
+        10, "The off-policy correction tries so many random subgoals.", unit="candidates"
+    )
     adjacency: AdjacencyConfig = AdjacencyConfig()
 
     @model_validator(mode="after")
@@ -124,19 +150,21 @@ class TutorConfig(LevelConfig):
 class ControllerConfig(LevelConfig):
     """The Controller: drives the joints towards the subgoal."""
 
-    termination_penalty: float = Field(
-        20.0, ge=0, description="taken off the reward where the task is terminated, as by a flip"
+    termination_penalty: float = setting(
+        20.0, "This is taken off the reward where the task is terminated, as by a flip.", unit="", ge=0
     )
-    tilt_penalty: float = Field(
-        0.0, ge=0, description="taken off the reward of every env step, times 1 - cos of the body's tilt after it"
+    tilt_penalty: float = setting(
+        0.0, "The reward of an env step loses this times 1 - cos of the body's tilt.", unit="", ge=0
     )
-    tilt_start: float = Field(1.0, gt=0, le=1, description="share of tilt_penalty that is taken off at first")
-    tilt_steps: float = Field(1e6, gt=0, description="env steps over which that share rises to 1, exponentially")
-    frame: Literal["world", "body"] = Field(
-        "world", description="axes of velocity, tilt and subgoal as it sees them: the world's, or turned with the body"
+    tilt_start: float = setting(1.0, "This share of tilt_penalty is taken off at first.", unit="", gt=0, le=1)
+    tilt_steps: float = setting(
+        1e6, "The share of tilt_penalty rises exponentially to 1 over so many env steps.", unit="env steps", gt=0
     )
-    hindsight: bool = Field(
-        False, description="replay half of the transitions with a subgoal that was reached; needs learner td3"
+    frame: Literal["world", "body"] = setting(
+        "world", "The Controller sees velocity, tilt and subgoal in the world's axes, or in axes turned with the body."
+    )
+    hindsight: bool = setting(
+        False, "Half of the replayed transitions get a subgoal that was reached; this needs learner td3."
     )
 
     @model_validator(mode="after")
@@ -155,8 +183,8 @@ class ControllerConfig(LevelConfig):
 class StarTrainerConfig(TrainerConfig):
     """The host loop, and the environments of its epochs and evaluations."""
 
-    num_envs: Batch = Field(128, description="environments stepped together, per seed")
-    eval_episodes: Batch = Field(100, description="episodes of each evaluation, per seed")
+    num_envs: Batch = setting(128, "So many environments of each seed are stepped together.", unit="environments")
+    eval_episodes: Batch = setting(100, "Each evaluation plays so many episodes of each seed.", unit="episodes")
 
 
 class Config(RunConfig):

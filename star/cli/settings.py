@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import json
+import difflib
 from typing import Any
 
 from star.cli.words import refuse_settings
 from star.config import kinds
-from star.config.loading import DEFAULT, fields
+from star.config.described import settings
+from star.config.loading import DEFAULT
 from star.config.section import ConfigError
 
-HELP = "list every setting with its default and meaning"
-DESCRIPTION = None
+HELP = "list every setting: meaning, type, range, unit, default"
+DESCRIPTION = "List settings: what each does, its type with range or choices, its unit and its default."
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Its arguments."""
-    parser.add_argument("prefix", nargs="?", default="", help="only settings that begin so, such as tutor")
+    parser.add_argument("word", nargs="?", default="", help="only settings with this in key or text, such as tutor")
     parser.add_argument("--experiment", default=DEFAULT, metavar="NAME", help="star (default), or MODULE:NAME")
 
 
@@ -25,10 +26,14 @@ def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     """Print the settings of a kind of experiment."""
     refuse_settings({key: value for key, value in overrides.items() if key != "experiment"})
     model = kinds.find(options.experiment).Config
-    rows = [row for row in fields(model) if row[0].startswith(options.prefix)]
-    if not rows:
-        raise ConfigError(f"{options.prefix}: no setting begins so; sections are {', '.join(model.model_fields)}")
-    width = max(len(key) for key, _, _ in rows)
-    for key, default, description in rows:
-        print(f"{key:{width}}  {description} (default {json.dumps(default)})")
+    word = options.word.lower()
+    found = [one for one in settings(model) if word in one.key or word in one.line.lower()]
+    if not found:
+        keys = {part for one in settings(model) for part in (one.key, *one.key.split("."))}
+        near = difflib.get_close_matches(word, sorted(keys), n=1)
+        meant = f" (did you mean {near[0]}?)" if near else f"; sections are {', '.join(model.model_fields)}"
+        raise ConfigError(f"{options.word}: no setting has this in its key or its text{meant}")
+    width = max(len(one.key) for one in found)
+    for one in found:
+        print(f"{one.key:{width}}  {one.line}")
     return 0

@@ -17,6 +17,7 @@ from envs.common.errors import UserError, shown
 from envs.common.files import nearest_file
 from envs.common.plainly import plain
 from star.config import kinds, shipped
+from star.config.described import EACH, settings
 from star.config.run import RunConfig
 from star.config.section import ConfigError, Section
 
@@ -167,15 +168,9 @@ def type_of(key: str, model: type[RunConfig]) -> Any:
     return annotation
 
 
-def fields(section: type[Section], prefix: str = "") -> Iterator[tuple[str, Any, str]]:
-    """All settings as (dotted key, default, description)."""
-    for name, field in section.model_fields.items():
-        annotation = field.annotation
-        if isinstance(annotation, type) and issubclass(annotation, Section) and annotation.model_fields:
-            yield from fields(annotation, f"{prefix}{name}.")
-        else:
-            default = {} if isinstance(field.default, Section) else field.default
-            yield f"{prefix}{name}", default, field.description or ""
+def fields(section: type[Section]) -> Iterator[tuple[str, Any, str]]:
+    """All settings as (dotted key, default, description), without those of what is in lists."""
+    return ((one.key, one.default, one.about) for one in settings(section) if EACH not in one.key)
 
 
 def dotted(config: RunConfig) -> dict[str, Any]:

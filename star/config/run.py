@@ -11,7 +11,7 @@ from pydantic import Field, create_model, field_validator
 from envs.common import reading
 from envs.common.errors import shown
 from star.config import plugins
-from star.config.section import Positive, Section
+from star.config.section import Positive, Section, setting
 
 
 def _is_simple(value: Any) -> bool:
@@ -24,10 +24,16 @@ def _is_simple(value: Any) -> bool:
 class EnvConfig(Section):
     """The task and the engine that simulates it."""
 
-    name: str = Field("point_maze", description="task, one of `star envs`, or module:name of your own")
-    engine: Literal["auto", "warp", "jax", "native"] = Field("auto", description="physics engine")
-    options: dict[str, Any] = Field({}, description="options of the task, passed to envs.make")
-    training: dict[str, Any] = Field({}, description="options that differ in training from those above")
+    name: str = setting(
+        "point_maze", "The agent learns this task.", allowed="a name that `star envs` lists, or module:name of your own"
+    )
+    engine: Literal["auto", "warp", "jax", "native"] = setting(
+        "auto", "This physics engine simulates the task; auto takes the best of this machine."
+    )
+    options: dict[str, Any] = setting({}, "These options are passed to envs.make.", allowed="options of the task")
+    training: dict[str, Any] = setting(
+        {}, "These options differ in training from those above.", allowed="options of the task"
+    )
 
     @field_validator("name")
     @classmethod
@@ -52,29 +58,31 @@ class EnvConfig(Section):
 class TrainerConfig(Section):
     """The host loop around the jitted epoch."""
 
-    total_env_steps: Annotated[int, Field(gt=0, lt=2**63)] = Field(
-        2_000_000, description="env steps, or iterations, per seed; the last epoch is finished"
+    total_env_steps: Annotated[int, Field(gt=0, lt=2**63)] = setting(
+        2_000_000,
+        "Each seed trains for so many env steps, or iterations; the last epoch is finished.",
+        unit="env steps",
     )
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="first seed")
-    num_seeds: Annotated[int, Field(gt=0, le=1024)] = Field(
-        1, description="seeds trained side by side: seed, seed + 1, ..."
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = setting(0, "This is the first seed.", unit="")
+    num_seeds: Annotated[int, Field(gt=0, le=1024)] = setting(
+        1, "So many seeds are trained side by side: seed, seed + 1, ...", unit="seeds"
     )
-    eval_every: Positive = Field(2, description="epochs between evaluations")
-    checkpoint_every: Positive = Field(4, description="epochs between checkpoints")
-    keep_checkpoints: Positive = Field(3, description="latest checkpoints kept, besides the best")
-    on_non_finite: Literal["stop", "rollback"] = Field(
+    eval_every: Positive = setting(2, "An evaluation follows every so many epochs.", unit="epochs")
+    checkpoint_every: Positive = setting(4, "A checkpoint is written every so many epochs.", unit="epochs")
+    keep_checkpoints: Positive = setting(
+        3, "So many of the latest checkpoints are kept, besides the best.", unit="checkpoints"
+    )
+    on_non_finite: Literal["stop", "rollback"] = setting(
         "stop",
-        description="when a number is NaN or infinite: stop, or go on from the last checkpoint with smaller steps",
+        "Where a number is NaN or infinite, the run stops, or goes on from the last checkpoint with smaller steps.",
     )
-    rollback_factor: float = Field(
-        0.5, gt=0, lt=1, description="on_non_finite rollback: on all learning rates of the seed, each time"
+    rollback_factor: float = setting(
+        0.5, "Each rollback multiplies all learning rates of the seed by this.", unit="", gt=0, lt=1
     )
-    rollbacks: Positive = Field(3, description="on_non_finite rollback: of one seed, before the run stops after all")
-    device: Literal["auto", "cpu", "gpu"] = Field("auto", description="where to train")
-    devices: Positive = Field(1, description="GPUs (or others) that share the work of each seed")
-    sinks: tuple[Literal["tensorboard", "wandb"], ...] = Field(
-        (), description="where metrics go besides metrics.jsonl: tensorboard, wandb"
-    )
+    rollbacks: Positive = setting(3, "After so many rollbacks of one seed the run stops after all.", unit="rollbacks")
+    device: Literal["auto", "cpu", "gpu"] = setting("auto", "The run trains on this kind of device.")
+    devices: Positive = setting(1, "So many GPUs, or others, share the work of each seed.", unit="devices")
+    sinks: tuple[Literal["tensorboard", "wandb"], ...] = setting((), "Metrics go there, besides metrics.jsonl.")
 
     @field_validator("sinks")
     @classmethod
@@ -88,7 +96,7 @@ class TrainerConfig(Section):
 class RunConfig(Section):
     """What every experiment's settings have; it adds its own sections."""
 
-    experiment: str = Field("star", description="what learns: star, or module:name of your own")
+    experiment: str = setting("star", "This is what learns.", allowed="star, or module:name of your own")
     trainer: TrainerConfig = TrainerConfig()
 
     @classmethod

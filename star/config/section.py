@@ -46,6 +46,19 @@ class Section(BaseModel):
         jax.tree_util.register_pytree_with_keys(cls, _flatten, lambda aux, leaves: _unflatten(cls, aux, leaves))
 
 
+def setting(default: Any, about: str, *, unit: str | None = None, allowed: str | None = None, **checks: Any) -> Any:
+    """A setting of a section: all that is checked of it, and all that `star settings` says of it, in one place.
+
+    Args:
+      default: its value where none is given; `...` for none.
+      about: one plain sentence.
+      unit: that of its numbers; "" where they have none.
+      allowed: what text or mappings are allowed, in words, where a check cannot tell.
+      checks: as of pydantic's `Field`, such as `gt=0`. Types tell more: `Literal`, `Positive`.
+    """
+    return Field(default, description=about, json_schema_extra={"unit": unit, "allowed": allowed}, **checks)
+
+
 def _is_leaf_field(cls: type[Section], name: str) -> bool:
     annotation = cls.model_fields[name].annotation
     return annotation is float or (isinstance(annotation, type) and issubclass(annotation, Section))

@@ -9,28 +9,37 @@ from pydantic import Field, SerializeAsAny, ValidationInfo, field_validator, mod
 
 from envs.common.errors import shown
 from star.config import plugins
-from star.config.section import Batch, Hidden, Positive, Repeats, Section
+from star.config.section import Batch, Hidden, Positive, Repeats, Section, setting
 from star.learners.protocol import Learner, LearnerConfig, Rollout
 
 NUMBER = 4  # bytes
+BUILT_IN = ("ppo", "td3")
 
 
 class PPOConfig(LearnerConfig):
     """Proximal policy optimisation (Schulman et al. 2017) with an adaptive learning rate."""
 
-    hidden: Hidden = Field((256, 256, 128), description="widths of the actor's and critic's layers")
-    learning_rate: float = Field(5e-4, gt=0, description="initial Adam step size; adaptive, never below 1e-5")
-    max_learning_rate: float = Field(1e-3, gt=0, description="ceiling of the adaptive step size")
-    target_kl: float = Field(0.016, gt=0, description="KL divergence per pass that the step size aims at")
-    discount: float = Field(0.95, ge=0, le=1, description="gamma per decision of the level")
-    gae_lambda: float = Field(0.95, ge=0, le=1, description="lambda of generalised advantage estimation")
-    clip: float = Field(0.2, gt=0, description="clip range of the probability ratio")
-    entropy: float = Field(0.0, ge=0, description="weight of the entropy bonus")
-    passes: Repeats = Field(4, description="passes over each rollout")
-    minibatches: Positive = Field(8, description="minibatches per pass")
-    initial_std: float = Field(0.8, gt=0, description="initial standard deviation of actions in [-1, 1]")
-    min_std: float = Field(0.05, gt=0, description="floor of the standard deviation")
-    max_grad_norm: float = Field(1.0, gt=0, description="gradient norms of actor and critic are clipped to this")
+    hidden: Hidden = setting((256, 256, 128), "Actor and critic have layers of these widths.", unit="units")
+    learning_rate: float = setting(
+        5e-4, "Adam begins with steps of this size, which adapt and never fall below 1e-5.", unit="", gt=0
+    )
+    max_learning_rate: float = setting(1e-3, "The adaptive step size never exceeds this.", unit="", gt=0)
+    target_kl: float = setting(0.016, "The step size aims at this KL divergence per pass.", unit="nats", gt=0)
+    discount: float = setting(
+        0.95,
+        "A reward counts by this factor less for each decision of the level that it lies ahead (gamma).",
+        unit="",
+        ge=0,
+        le=1,
+    )
+    gae_lambda: float = setting(0.95, "Generalised advantage estimation uses this lambda.", unit="", ge=0, le=1)
+    clip: float = setting(0.2, "The probability ratio is clipped to 1 plus or minus this.", unit="", gt=0)
+    entropy: float = setting(0.0, "The entropy bonus has this weight in the loss.", unit="", ge=0)
+    passes: Repeats = setting(4, "Each update makes so many passes over its rollout.", unit="passes")
+    minibatches: Positive = setting(8, "A pass cuts the rollout into so many equal minibatches.", unit="minibatches")
+    initial_std: float = setting(0.8, "Actions in [-1, 1] have this standard deviation at first.", unit="", gt=0)
+    min_std: float = setting(0.05, "The standard deviation of actions never falls below this.", unit="", gt=0)
+    max_grad_norm: float = setting(1.0, "The gradient norms of actor and critic are clipped to this.", unit="", gt=0)
 
     def check(self, rollout: Rollout) -> None:
         """Minibatches are equal shares of a rollout, and are cut into equal shares for devices."""
@@ -54,8 +63,8 @@ class PPOConfig(LearnerConfig):
 class BufferedConfig(Section):
     """Settings of what learns from batches of a buffer."""
 
-    batch_size: Batch = Field(128, description="transitions per update")
-    buffer_size: Positive = Field(200_000, description="transitions kept")
+    batch_size: Batch = setting(128, "Each update learns from so many transitions.", unit="transitions")
+    buffer_size: Positive = setting(200_000, "The buffer keeps so many transitions.", unit="transitions")
 
     @model_validator(mode="after")
     def _batch_fits_the_buffer(self) -> Self:
@@ -67,17 +76,29 @@ class BufferedConfig(Section):
 class TD3Config(BufferedConfig, LearnerConfig):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018), as published for STAR."""
 
-    hidden: Hidden = Field((300, 300), description="widths of the actor's and critics' layers")
-    actor_learning_rate: float = Field(1e-4, gt=0, description="Adam step size of the actor")
-    critic_learning_rate: float = Field(1e-3, gt=0, description="Adam step size of the critics")
-    discount: float = Field(0.95, ge=0, le=1, description="gamma per decision of the level")
-    tau: float = Field(0.005, gt=0, le=1, description="rate at which the target networks follow")
-    min_transitions: Positive = Field(1000, description="transitions needed before the first update")
-    updates_per_rollout: Repeats = Field(10, description="gradient updates after each rollout")
-    policy_delay: Positive = Field(2, description="critic updates per actor update")
-    target_noise: float = Field(0.2, ge=0, description="smoothing noise of target actions in [-1, 1]")
-    target_noise_clip: float = Field(0.5, ge=0, description="clip of the smoothing noise")
-    exploration_noise: float = Field(0.1, ge=0, description="standard deviation of exploration, actions in [-1, 1]")
+    hidden: Hidden = setting((300, 300), "Actor and critics have layers of these widths.", unit="units")
+    actor_learning_rate: float = setting(1e-4, "Adam takes steps of this size for the actor.", unit="", gt=0)
+    critic_learning_rate: float = setting(1e-3, "Adam takes steps of this size for the critics.", unit="", gt=0)
+    discount: float = setting(
+        0.95,
+        "A reward counts by this factor less for each decision of the level that it lies ahead (gamma).",
+        unit="",
+        ge=0,
+        le=1,
+    )
+    tau: float = setting(
+        0.005, "Target networks move by this share of the difference after each update.", unit="", gt=0, le=1
+    )
+    min_transitions: Positive = setting(1000, "The first update waits for so many transitions.", unit="transitions")
+    updates_per_rollout: Repeats = setting(10, "Each rollout is followed by so many gradient updates.", unit="updates")
+    policy_delay: Positive = setting(2, "The actor is updated once in so many updates of the critics.", unit="updates")
+    target_noise: float = setting(
+        0.2, "Target actions in [-1, 1] are smoothed by noise of this standard deviation.", unit="", ge=0
+    )
+    target_noise_clip: float = setting(0.5, "The smoothing noise is clipped to this.", unit="", ge=0)
+    exploration_noise: float = setting(
+        0.1, "Actions in [-1, 1] are explored with noise of this standard deviation.", unit="", ge=0
+    )
 
     replays: ClassVar[bool] = True
 
@@ -102,16 +123,23 @@ class TD3Config(BufferedConfig, LearnerConfig):
 class LevelConfig(Section):
     """What Tutor and Controller have in common: a learner and a reward."""
 
-    learner: str = Field("ppo", description="learning algorithm: ppo, td3, or module:name of your own")
-    reward: Literal["distance", "progress"] = Field("progress", description="minus the distance, or its decrease")
-    reward_scale: float = Field(1.0, gt=0, description="factor on the reward")
-    termination_penalty: float = Field(
-        0.0, ge=0, description="taken off the reward where the task is terminated, as by a flip"
+    learner: str = setting(
+        "ppo", "The level learns by this algorithm.", allowed=f"{', '.join(BUILT_IN)} or module:name of your own"
+    )
+    reward: Literal["distance", "progress"] = setting(
+        "progress", "The reward is minus the distance to the target, or how much it decreases."
+    )
+    reward_scale: float = setting(1.0, "The reward is multiplied by this.", unit="", gt=0)
+    termination_penalty: float = setting(
+        0.0, "This is taken off the reward where the task is terminated, as by a flip.", unit="", ge=0
     )
     ppo: PPOConfig = Field(PPOConfig(), description="settings used when learner is ppo")
     td3: TD3Config = Field(TD3Config(), description="settings used when learner is td3")
-    own: SerializeAsAny[LearnerConfig] = Field(
-        LearnerConfig(), validate_default=True, description="settings of a learner of your own"
+    own: SerializeAsAny[LearnerConfig] = setting(
+        LearnerConfig(),
+        "These are the settings of a learner of your own.",
+        allowed="those of its Config",
+        validate_default=True,
     )
 
     @field_validator("learner")
@@ -146,9 +174,6 @@ class LevelConfig(Section):
     def settings(self) -> Any:
         """Those of the learner in use."""
         return getattr(self, self.group)
-
-
-BUILT_IN = ("ppo", "td3")
 
 
 def _own(name: str) -> type[LearnerConfig]:

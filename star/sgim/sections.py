@@ -6,32 +6,36 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from star.config.section import Batch, Positive, Section
+from star.config.section import Batch, Positive, Section, setting
 
 
 class SelectionConfig(Section):
     """SGIM's choice of regions, strategies and goals."""
 
-    window: Annotated[int, Field(ge=4, le=2**20)] = Field(80, description="episodes remembered of each region")
-    per_block: Positive = Field(16, description="episodes of one block that each region remembers at most")
-    drift: float = Field(
-        0.001, gt=0, description="doubt about what a strategy adds grows by this in a block; it begins with 1"
+    window: Annotated[int, Field(ge=4, le=2**20)] = setting(
+        80, "So many episodes of each region are remembered.", unit="episodes"
     )
-    optimism: float = Field(
-        0.01, ge=0, description="what the root of a doubt of 1 is worth at most (units of competence per block)"
+    per_block: Positive = setting(16, "Each region remembers at most so many episodes of one block.", unit="episodes")
+    drift: float = setting(
+        0.001, "The doubt about what a strategy adds begins with 1 and grows by this in a block.", unit="", gt=0
     )
-    forgetting: float = Field(
-        0.0, ge=0, le=1, description="what lost competence is worth of an equal gain; 1 is absolute progress"
+    optimism: float = setting(
+        0.01, "The root of a doubt of 1 is worth at most this.", unit="competence per block", ge=0
     )
-    random: float = Field(0.05, ge=0, le=1, description="share of choices drawn evenly")
-    best: float = Field(0.2, ge=0, le=1, description="share of choices whose goal is near a region's best point")
-    best_point: Literal["progress", "worst"] = Field(
-        "progress", description="best point of a region: where competence grew most, or is lowest"
+    forgetting: float = setting(
+        0.0, "Lost competence is worth this share of an equal gain; 1 is absolute progress.", unit="", ge=0, le=1
     )
-    sharpness: float = Field(12.0, gt=0, description="choices are drawn in proportion to interest to this power")
-    focus: float = Field(0.1, gt=0, le=1, description="how near: half-width as a share of the region's width")
-    min_side: Positive = Field(8, description="remembered goals on each side of a cut at least")
-    min_width: float = Field(1e-3, gt=0, description="no region is cut narrower than this (units of goals)")
+    random: float = setting(0.05, "This share of choices is drawn evenly.", unit="", ge=0, le=1)
+    best: float = setting(0.2, "This share of choices has its goal near a region's best point.", unit="", ge=0, le=1)
+    best_point: Literal["progress", "worst"] = setting(
+        "progress", "The best point of a region is where competence grew most, or where it is lowest."
+    )
+    sharpness: float = setting(12.0, "Choices are drawn in proportion to interest to this power.", unit="", gt=0)
+    focus: float = setting(
+        0.1, "Near the best point means within this share of the region's width.", unit="", gt=0, le=1
+    )
+    min_side: Positive = setting(8, "So many remembered goals lie on each side of a cut at least.", unit="goals")
+    min_width: float = setting(1e-3, "No region is cut narrower than this.", unit="units of goals", gt=0)
 
     @model_validator(mode="after")
     def _shares_fit(self) -> Self:
@@ -49,56 +53,71 @@ class SelectionConfig(Section):
 class EpochSelectionConfig(SelectionConfig):
     """SGIM's choices where many environments make them from the same state: spread more widely."""
 
-    sharpness: float = Field(2.0, gt=0, description=SelectionConfig.model_fields["sharpness"].description)
+    sharpness: float = setting(
+        2.0,
+        "Choices are drawn in proportion to interest to this power.",
+        unit="",
+        gt=0,
+    )
 
 
 class TeacherConfig(Section):
     """One teacher: demonstrations, what they are used for, and what it takes to ask."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$", max_length=64)] = Field(description="in metrics and figures")
-    kind: Literal["action", "outcome", "decomposition"] = Field(
-        description="what is shown: movements to imitate, outcomes to aim at, or routes to a goal"
+    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$", max_length=64)] = setting(
+        ..., "Metrics and figures call the teacher by this name."
     )
-    source: str = Field("map", description="file of demonstrations (.npz), or map: shortest paths, routes only")
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = Field(
-        None, description="of that file; a run notes it, and goes on with no other file"
+    kind: Literal["action", "outcome", "decomposition"] = setting(
+        ..., "The teacher shows movements to imitate, outcomes to aim at, or routes to a goal."
     )
-    flaw: Literal["repetitive", "wrong_half", "other_body"] | None = Field(
-        None, description="what makes it a poor teacher, for experiments"
+    source: str = setting(
+        "map",
+        "The demonstrations come from this file, or are shortest paths on the map, which show routes only.",
+        allowed="a file (.npz), or map",
     )
-    cost: float = Field(1.0, gt=0, description="of an episode, relative to one alone")
-    availability: float = Field(1.0, ge=0, le=1, description="share of epochs in which the teacher is there")
-    max_queries: Positive | None = Field(None, description="episodes that may be asked for; null: any number")
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = setting(
+        None, "The file has this checksum; a run notes it, and goes on with no other file."
+    )
+    flaw: Literal["repetitive", "wrong_half", "other_body"] | None = setting(
+        None, "This makes it a poor teacher, for experiments."
+    )
+    cost: float = setting(1.0, "An episode with the teacher costs so many times what one alone does.", unit="", gt=0)
+    availability: float = setting(1.0, "The teacher is there in this share of epochs.", unit="", ge=0, le=1)
+    max_queries: Positive | None = setting(
+        None, "So many episodes may be asked for; with null any number.", unit="episodes"
+    )
 
 
 class SgimConfig(Section):
     """SGIM in the trainer: intrinsic motivation chooses goals, strategies, teachers, targets and what to examine."""
 
-    goals: bool = Field(False, description="training goals are chosen by progress, instead of drawn as the task says")
-    strategies: tuple[Literal["autonomous", "babbling", "decomposition"], ...] = Field(
+    goals: bool = setting(False, "Training goals are chosen by progress, not drawn as the task says.")
+    strategies: tuple[Literal["autonomous", "babbling", "decomposition"], ...] = setting(
         ("autonomous",),
+        "These are the ways to practise alone: as ever, by random subgoals, or via a region.",
         min_length=1,
-        description="ways to practise alone: as ever, by random subgoals, or via a region",
     )
-    teachers: tuple[TeacherConfig, ...] = Field((), max_length=64, description="teachers that may be asked for help")
-    ask: Literal["progress", "evenly"] = Field(
-        "progress", description="which strategy: by progress over cost, or each as often, as in SGIM-D"
+    teachers: tuple[TeacherConfig, ...] = setting(
+        (), "These teachers may be asked for help.", allowed="with the keys below", max_length=64
     )
-    unaided: bool = Field(
-        True, description="ask progress: who would ask goes alone instead, as often as the region is mastered"
+    ask: Literal["progress", "evenly"] = setting(
+        "progress", "The strategy is chosen by progress over cost, or each as often, as in SGIM-D."
     )
-    exploration: bool = Field(False, description="the Commander's random targets are drawn by progress")
-    refinement: bool = Field(False, description="examine first what is half mastered and makes no progress")
-    waypoint_radius: float = Field(2.0, gt=0, description="m: so near a waypoint is passed")
-    detours: bool = Field(True, description="what a teacher only goes around to is not believed to be reached directly")
-    subgoals: bool = Field(
-        True, description="on the way to a teacher's waypoint the Tutor is shown subgoals straight ahead, to imitate"
+    unaided: bool = setting(True, "With ask progress, who would ask goes alone as often as the region is mastered.")
+    exploration: bool = setting(False, "The Commander's random targets are drawn by progress.")
+    refinement: bool = setting(False, "What is half mastered and makes no progress is examined first.")
+    waypoint_radius: float = setting(2.0, "A waypoint counts as passed within this distance.", unit="m", gt=0)
+    detours: bool = setting(True, "What a teacher only goes around to is not believed to be reached directly.")
+    subgoals: bool = setting(
+        True, "On the way to a teacher's waypoint the Tutor is shown subgoals straight ahead, to imitate."
     )
-    margin: float = Field(0.0, ge=0, description="learner q: what a teacher's choice is to be better by than others")
-    imitation: float = Field(
-        1.0, ge=0, description="weight of what is demonstrated in the losses of the Tutor's and Controller's actors"
+    margin: float = setting(0.0, "Learner q values a teacher's choice above all others by this.", unit="", ge=0)
+    imitation: float = setting(
+        1.0, "Demonstrations have this weight in the losses of the Tutor's and Controller's actors.", unit="", ge=0
     )
-    imitation_batch: Batch = Field(256, description="demonstrated actions in each of its updates")
+    imitation_batch: Batch = setting(
+        256, "Each update of these actors imitates so many demonstrated actions.", unit="actions"
+    )
     selection: EpochSelectionConfig = EpochSelectionConfig()
 
     @property

@@ -14,6 +14,7 @@ from star.agent import exam_tables, exams
 from star.agent.sections import Config
 from star.cli import main
 from star.cli.words import split_settings
+from star.config import described
 from star.config.loading import fields
 from star.training import trainer
 
@@ -183,7 +184,11 @@ def refusal(capsys, folder, arguments):
         pytest.param("report runs/old --out a/b.html", "there is no folder a", id="report into no folder"),
         pytest.param("report runs/old --out old.html", "old.html: exists; replace it with --force", id="report over"),
         pytest.param("report runs/old --out a.html --tutor.period 5", "takes no settings", id="report with a setting"),
-        pytest.param("settings tutr", "tutr: no setting begins so", id="unknown prefix"),
+        pytest.param(
+            "settings tutr",
+            "tutr: no setting has this in its key or its text (did you mean tutor?)",
+            id="unknown setting",
+        ),
         pytest.param("settings --tutor.period=5", "takes no settings", id="settings with a setting"),
         pytest.param("envs --tutor.period 5", "takes no settings", id="envs with a setting"),
     ],
@@ -382,15 +387,26 @@ def test_help_shows_how_to_train_resume_and_evaluate(capsys, arguments):
 def test_settings_lists_every_key_with_its_default(capsys):
     assert main(["settings"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == [key for key, _, _ in fields(Config)]
-    for line, (_, default, description) in zip(lines, fields(Config), strict=True):
-        assert line.endswith(f"{description} (default {json.dumps(default)})")
+    every = list(described.settings(Config))
+    assert [line.split()[0] for line in lines] == [one.key for one in every]
+    assert [one.key for one in every if "[]" not in one.key] == [key for key, _, _ in fields(Config)]
+    for line, one in zip(lines, every, strict=True):
+        default = "none" if one.field.is_required() else json.dumps(one.default)
+        assert one.about in line and line.endswith(f"; default {default}]")
 
 
-def test_settings_can_be_narrowed_down(capsys):
-    assert main(["settings", "tutor.ppo"]) == 0
-    keys = [line.split()[0] for line in capsys.readouterr().out.splitlines()]
-    assert keys == [key for key, _, _ in fields(Config) if key.startswith("tutor.ppo.")]
+@pytest.mark.parametrize(
+    ("word", "keys"),
+    [
+        ("tutor.ppo", [key for key, _, _ in fields(Config) if key.startswith("tutor.ppo.")]),
+        ("TILT", ["controller.tilt_penalty", "controller.tilt_start", "controller.tilt_steps", "controller.frame"]),
+        ("checksum", ["sgim.teachers[].sha256"]),
+        ("wandb", ["trainer.sinks"]),
+    ],
+)
+def test_settings_are_found_by_a_part_of_key_or_text(word, keys, capsys):
+    assert main(["settings", word]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == keys
 
 
 def test_envs_lists_every_task(capsys):

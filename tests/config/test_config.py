@@ -1,14 +1,17 @@
 import json
+import re
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 import pytest
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from envs.common.errors import UserError
 from star.agent.sections import Config
+from star.config import described, loading
 from star.config.loading import fields, load, parse
-from star.config.section import Section
+from star.config.section import Section, setting
 
 DEFAULTS = {key: default for key, default, _ in fields(Config)}
 
@@ -330,6 +333,82 @@ def test_fields_lists_every_setting_with_its_default_and_meaning():
         assert (value.model_dump() if isinstance(value, Section) else value) == default
         assert description
     assert {"env.name", "tutor.ppo.hidden", "trainer.num_seeds"} <= set(DEFAULTS)
+
+
+def lacks(one):
+    """What a person is not told of a setting."""
+    kind = str(one.field.annotation)
+    numbers = re.search(r"\b(int|float)\b", kind) is not None
+    faults = {
+        "sentence": not re.fullmatch(r"[A-Z].*\.", one.about) or len(one.about.split()) > 25,
+        "unit": numbers and one.unit is None,
+        "range": numbers and not re.search(r"\d|inside", one.allowed),
+        "choices": one.allowed in ("text", "mapping"),
+    }
+    found = {name for name, lacking in faults.items() if lacking}
+    return found
+
+
+def test_every_setting_says_type_range_or_choices_unit_and_a_sentence():
+    assert {one.key: lacking for one in described.settings(Config) if (lacking := lacks(one))} == {}
+
+
+class Untold(Section):
+    period: int = Field(5, gt=0, description="Decisions are made once in so many env steps.")
+    rate: float = setting(0.5, "The rate.", unit="")
+    name: str = setting("a", "It is called so.")
+    share: float = setting(0.5, "share of targets", unit="", ge=0, le=1)
+    every: Annotated[tuple[int, ...], Field(max_length=3)] = setting((), "So many each.", unit="m")
+    whole: int | None = setting(None, "Whole.", unit="m", gt=0, lt=2**31)
+
+
+def test_what_a_setting_does_not_say_is_found():
+    found = {one.key: lacks(one) for one in described.settings(Untold)}
+    assert found == {
+        "period": {"unit"},
+        "rate": {"range"},
+        "name": {"choices"},
+        "share": {"sentence"},
+        "every": set(),
+        "whole": set(),
+    }
+
+
+@pytest.mark.parametrize(
+    ("key", "allowed", "unit"),
+    [
+        ("commander.discount", "number from 0, below 1", ""),
+        ("commander.period", "whole number from 1 to 2^31 - 1", "env steps"),
+        ("commander.hold", "one of false, true, region", None),
+        ("tutor.heading", "number above 0, or null", "m"),
+        ("tutor.learner", "text: ppo, td3 or module:name of your own", None),
+        ("tutor.ppo.hidden", "list of at most 16, each whole number from 1 to 16,384", "units"),
+        ("sgim.teachers[].sha256", "text like ^[0-9a-f]{64}$, or null", None),
+        ("trainer.sinks", "list, each one of tensorboard, wandb", None),
+    ],
+)
+def test_what_is_shown_of_a_setting_is_what_is_checked(key, allowed, unit):
+    (one,) = (one for one in described.settings(Config) if one.key == key)
+    assert (one.allowed, one.unit) == (allowed, unit)
+
+
+@pytest.mark.parametrize(
+    "one", [one for one in described.settings(Config) if "number" in one.allowed], ids=lambda one: one.key
+)
+def test_a_number_at_the_edge_of_its_range_is_taken_and_one_beyond_it_refused(one):
+    """Read from what is shown, so that it would notice another range than the one that is checked."""
+    if "[]" in one.key or one.allowed.startswith("list"):
+        return
+    config, wrong = Config(), []
+    for word, edge in re.findall(r"(from|above|to|at most|below) (2\^\d+ - 1|[\d.e+,-]*\d)", one.allowed):
+        number = 2 ** int(edge[2:].split()[0]) - 1 if "^" in edge else float(edge.replace(",", ""))
+        step = {"from": -1, "above": 0, "to": 1, "at most": 1, "below": 0}[word]
+        wrong.append(number + step)
+    assert wrong
+    for number in wrong:
+        value = int(number) if "whole" in one.allowed else number
+        with pytest.raises(UserError, match=re.escape(f"test: {one.key}: ")):
+            loading.check_setting(config, one.key, value, source="test")
 
 
 def test_every_shipped_file_is_valid_and_names_a_task(pytestconfig):
