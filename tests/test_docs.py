@@ -315,20 +315,23 @@ def test_the_example_of_the_how_to_page_plays_a_trained_agent(run, tmp_path, mon
     assert said == f"success at any step: {end.episode.success_any.mean()} at the last: 0.0"
 
 
-def test_the_examples_of_the_python_page_act_train_and_evaluate(run, tmp_path, monkeypatch, capsys):
+def test_the_examples_of_the_python_page_act_train_evaluate_and_export(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "NAME").symlink_to(run)
     (tmp_path / "point_maze").write_text(
         json.dumps(smaller.RUN | {"trainer": smaller.RUN["trainer"] | {"total_env_steps": 240}})
     )
-    act, train = blocks("docs/python.md", "python")
+    act, train, export, read = blocks("docs/python.md", "python")
     names: dict = {}
     exec(act.replace('goals="test"', 'goals="test", episode_length=40'), names)
     assert names["truncated"] and names["agent"].env_steps == 160
     exec(train.replace("200", "4"), names)
     assert (names["result"]["env_steps"], len(names["row"]["seeds"]), names["row"]["episodes"]) == (240, 2, 8)
     assert capsys.readouterr().out.startswith("reached: False at [")
+    exec(export, names)
+    exec(read, names)
+    assert names["action"].shape == (16, 2)
 
 
 def test_the_example_of_the_sgim_page_learns_all_three_exercises_and_asks_the_teacher():

@@ -13,9 +13,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import export
 from jaxtyping import Array, Float
 
+from envs.common import files
 from envs.common.errors import UserError
 from star.agent import commands, hierarchy, levels
 from star.agent.decisions import Memory, Roadmap
@@ -27,6 +30,7 @@ from star.training import checkpoint as saved
 from star.training import program as programs
 from star.training.program import Program
 
+EXPORTED = ".stablehlo"  # the ending of an exported Controller
 _DICT = ("observation", "desired_goal")  # of what Gymnasium's environments show, what an agent sees
 
 
@@ -52,7 +56,10 @@ class _Functions(NamedTuple):
 
 @dataclass
 class _Episode:
-    """Where the hierarchy stands in the episodes of B bodies, after `steps` env steps. `before` is the last `obs`."""
+    """Where the hierarchy stands in the episodes of B bodies, after `steps` env steps.
+
+    `before` is the last observation [B, n], and `shape` its leading axes as they were given: [] or [B].
+    """
 
     state: TrainState
     roadmap: Roadmap
@@ -61,6 +68,7 @@ class _Episode:
     subgoal: Any = None
     before: Any = None
     steps: int = 0
+    shape: tuple[int, ...] = ()
 
 
 class TrainedAgent:
@@ -134,7 +142,8 @@ class TrainedAgent:
         else:
             episode.subgoal, action = functions.go_on(hyper, episode.state, episode.subgoal, episode.before, batch)
         episode.before, episode.steps = batch, episode.steps + 1
-        return np.clip(np.asarray(action), -1.0, 1.0).reshape(*given.shape[:-1], self.action_size)
+        episode.shape = given.shape[:-1]
+        return np.clip(np.asarray(action), -1.0, 1.0).reshape(*episode.shape, -1)
 
     def render(self, path: str | Path, *, force: bool = False, **how: Any) -> str:
         """Write a picture or a film of a test episode, and return a line about it; the ending of `path` decides.
@@ -154,6 +163,32 @@ class TrainedAgent:
             agent=self.seed,
             quiet=True,
         )
+
+    @property
+    def subgoal(self) -> Float[np.ndarray, "*batch m"] | None:
+        """Where the Controller is going after the last `act`, relative to the body; None before the first.
+
+        Points are displacements [p] in units of the state. Without a Tutor it is the lower and the upper corner [2d]
+        of the target box.
+        """
+        if self._episode is None or self._episode.subgoal is None:
+            return None
+        return np.asarray(self._episode.subgoal).reshape(*self._episode.shape, -1)
+
+    def export(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the greedy Controller as a program of its own, which JAX runs without this package.
+
+        It is `jax.export`'s file of StableHLO for CPUs and NVIDIA's GPUs, of a function from observations [B, n] and
+        subgoals [B, m], as of `subgoal`, to actions [B, act] in [-1, 1]; any B. It is read back by
+        `jax.export.deserialize(bytearray(Path(path).read_bytes())).call(obs, subgoal)`.
+
+        Raises:
+          UserError: in one line, if the file cannot be written, or exists and `force` is not set.
+        """
+        files.check(Path(path), (EXPORTED,), force=force)
+        written = _exported(self.spec, self._program.hyper, self._state)
+        with files.whole(Path(path)) as partial_path:
+            partial_path.write_bytes(written)
 
     def _begun(self, obs: Float[np.ndarray, "B n"]) -> _Episode:
         return _Episode(*self._functions.begin(self._program.hyper, self._state, obs, self._key))
@@ -217,6 +252,20 @@ def _go_on(
 def _onward(spec: Spec, config: AgentConfig, roadmap: Roadmap, memory: Memory, obs: Array) -> Memory:
     """The memory after a segment."""
     return hierarchy.onward(levels.of(config, spec, greedy=True), roadmap, memory, obs)
+
+
+def _exported(spec: Spec, config: AgentConfig, state: TrainState) -> bytearray:
+    """The greedy Controller as `jax.export` writes it; what it has learnt is inside."""
+    agent = levels.of(config, spec, greedy=True)
+
+    def controller(obs: Float[Array, "B n"], subgoal: Float[Array, "B m"]) -> Float[Array, "B act"]:
+        seen = hierarchy.observe(agent, obs, subgoal)
+        return jnp.clip(hierarchy.act(agent, state, seen, explore=False, key=state.key), -1.0, 1.0)
+
+    (batch,) = export.symbolic_shape("B")
+    sizes = (spec.state_dim + len(spec.goal_indices), agent.task.subgoals.size)
+    shapes = [jax.ShapeDtypeStruct((batch, size), jnp.float32) for size in sizes]
+    return export.export(jax.jit(controller), platforms=("cpu", "cuda"))(*shapes).serialize()
 
 
 def _as_array(obs: Any, size: int) -> Float[np.ndarray, "*batch n"]:

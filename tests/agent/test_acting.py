@@ -1,6 +1,7 @@
 """`star.load`, `star.train` and `star.evaluate`: the same numbers as those of the commands."""
 
 import json
+import os
 import subprocess
 import sys
 import time
@@ -129,6 +130,38 @@ def test_it_draws_itself(agent, can_draw, tmp_path):
         agent.render(tmp_path / "end.png")
     with pytest.raises(UserError, match="cannot tell what to write"):
         agent.render(tmp_path / "end.doc")
+
+
+READER = """
+import sys, jax, numpy as np
+from pathlib import Path
+
+program, data, out = sys.argv[1:]
+controller = jax.export.deserialize(bytearray(Path(program).read_bytes()))
+given = np.load(data)
+np.save(out, controller.call(given["obs"], given["subgoal"]))
+assert not {"star", "envs", "flax", "brax"} & {name.partition(".")[0] for name in sys.modules}
+"""
+
+
+def test_its_controller_is_read_back_by_jax_alone(agent, tmp_path):
+    obs = np.random.default_rng(0).normal(size=(STEPS, 3, 6)).astype(np.float32).cumsum(axis=0)
+    acted = [(agent.act(one), agent.subgoal) for one in obs]
+    actions, subgoals = (np.concatenate(each) for each in zip(*acted, strict=True))
+    assert agent.subgoal.shape == (3, 2) and np.abs(np.diff(actions, axis=0)).max() > 0.1
+    agent.export(tmp_path / "controller.stablehlo")
+    np.savez(tmp_path / "given.npz", obs=obs.reshape(-1, 6), subgoal=subgoals)
+    paths = [str(tmp_path / name) for name in ("controller.stablehlo", "given.npz", "actions.npy")]
+    libraries = os.pathsep.join(path for path in sys.path if path and Path(path).resolve() != Path(__file__).parents[2])
+    here = {**os.environ, "PYTHONPATH": libraries}
+    subprocess.run([sys.executable, "-c", READER, *paths], cwd=tmp_path, env=here, check=True)
+    np.testing.assert_allclose(np.load(tmp_path / "actions.npy"), actions, atol=1e-5)
+    with pytest.raises(UserError, match="exists"):
+        agent.export(tmp_path / "controller.stablehlo")
+    with pytest.raises(UserError, match="allowed endings: .stablehlo"):
+        agent.export(tmp_path / "controller.onnx")
+    agent.reset()
+    assert agent.subgoal is None
 
 
 @pytest.mark.parametrize(

@@ -135,7 +135,7 @@ def test_the_other_commands_work_on_it(here, capsys):
     page = Path("report.html").read_text()
     assert '"unit":"pulls"' in page and '"key":"eval/pay"' in page and "bandit/error" in page
     assert main(["settings", "--experiment", "bandit:KIND", "learning"]) == 0
-    assert "share of an error that is learnt (default 0.1)" in capsys.readouterr().out
+    assert "share of an error that is learnt [number above 0, at most 1; default 0.1]" in capsys.readouterr().out
 
 
 def test_floats_are_tried_side_by_side_and_whole_numbers_apart(here, monkeypatch):
