@@ -26,6 +26,7 @@ from flax import struct
 from mujoco import rollout
 
 from envs._quiet import mjx
+from envs.common import extras
 from envs.common.batching import flattened
 from envs.common.errors import UserError
 from envs.options import EnvError
@@ -128,7 +129,7 @@ def resolve_engine(engine: str) -> str:
 
 
 def _require(*, nvidia: bool) -> None:
-    needs = (("an NVIDIA GPU", nvidia), ('pip install "star-rl[warp]"', _has_warp()))
+    needs = (("an NVIDIA GPU", nvidia), (extras.install("warp"), _has_warp()))
     lacking = [need for need, met in needs if not met]
     if lacking:
         raise EnvError(f'engine "warp" needs {" and ".join(lacking)}; here choose native, jax or auto')

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from envs.common import files
+from envs.common import extras, files
 from envs.options import EnvError
 
 STILLS = (".png", ".jpg")
@@ -155,4 +155,4 @@ def _ffmpeg() -> str:
             return imageio_ffmpeg.get_ffmpeg_exe()
         except RuntimeError:
             pass
-    raise EnvError('.mp4 needs ffmpeg: pip install "star-rl[video]", or choose .html, .gif or .png')
+    raise EnvError(f".mp4 needs ffmpeg: {extras.install('video')}, or choose .html, .gif or .png")

@@ -9,7 +9,7 @@ from typing import Any
 from envs.common.errors import UserError
 from envs.common.files import given_back, new_place
 from star.config import kinds
-from star.config.loading import experiment_of, load_to_act, parse
+from star.config.loading import experiment_of, kind_of, load_to_act, parse
 from star.config.loading import load as load_config
 from star.config.run import RunConfig
 
@@ -80,8 +80,7 @@ def evaluate(
     """
     if checkpoint == "all":
         raise UserError("checkpoint: 'all' is not allowed: should be last, best or env steps")
-    kind = kinds.find(experiment_of(Path(run)))
-    measure = kind.commands.get("measure", _measure)
+    measure = kind_of(Path(run)).commands.get("measure", _measure)
     (row,) = measure(Path(run), settings or {}, checkpoint=str(checkpoint), seed=seed)
     return row
 
@@ -97,9 +96,9 @@ def load(run: str | Path, *, checkpoint: str | int = "last", seed: int | None = 
     Raises:
       UserError: in one line, if there is no such run or checkpoint, or its experiment has no agent that acts.
     """
-    name = experiment_of(Path(run))
-    commands = kinds.find(name).commands
+    commands = kind_of(Path(run)).commands
     if "load" not in commands:
+        name = experiment_of(Path(run))
         raise UserError(f"{run}: is a run of experiment {name}, which has no agent that acts")
     return commands["load"](Path(run), checkpoint=str(checkpoint), seed=seed)
 

@@ -105,8 +105,8 @@ def sync(path: Path) -> None:
 def nearest_file(path: Path, endings: Sequence[str]) -> str:
     """` (did you mean ...?)` with the file beside `path` whose name is most like it, of those with these endings."""
     try:
-        names = [entry.name for entry in path.parent.iterdir() if entry.suffix in endings]
+        names = {entry.stem: entry for entry in path.parent.iterdir() if entry.suffix in endings}
     except (OSError, ValueError):  # no such folder, or not one of ours
         return ""
-    matches = difflib.get_close_matches(path.name, names, n=1, cutoff=0.5)
-    return f" (did you mean {path.parent / matches[0]}?)" if matches else ""
+    matches = difflib.get_close_matches(path.stem, names, n=1)
+    return f" (did you mean {names[matches[0]]}?)" if matches else ""

@@ -116,7 +116,7 @@ def check_place(out: Path, *, force: bool) -> None:
     files.check_name(out)
     above = next(path for path in (out, *out.absolute().parents) if path.exists())
     if not above.is_dir():
-        raise ConfigError(f"--out: {out}: {above} is a file, not a folder")
+        raise ConfigError(f"--out: {above} is a file, not a folder")
     if not os.access(above, os.W_OK):
         raise ConfigError(f"--out: {out}: the folder {above} is not writable")
     if (out / ROWS).exists() and not force:

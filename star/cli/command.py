@@ -37,6 +37,8 @@ COMMANDS: Mapping[str, ModuleType] = {
 }
 """Each has `HELP`, `DESCRIPTION`, `add(parser)` and `run(options, overrides)`, which returns the exit code."""
 
+_WITHOUT_SETTINGS = ("ls", "report", "configs", "envs", "settings")
+
 _HELP = """\
 Train a three-level agent (Commander, Tutor, Controller) whose goal regions refine themselves.
 
@@ -67,7 +69,10 @@ class _Parser(argparse.ArgumentParser):
             near = difflib.get_close_matches(wrong[1], COMMANDS, n=1)
             meant = f"did you mean star {near[0]}?" if near else f"allowed: {', '.join(COMMANDS)}"
             raise ConfigError(f"star: {wrong[1]!r} is no command ({meant})")
-        raise ConfigError(f"{self.prog}: {message} (see {self.prog} --help)")
+        choice = re.search(r"invalid choice: '(.*?)' \(choose from (.*)\)", message)
+        near = difflib.get_close_matches(choice[1], re.findall(r"[\w-]+", choice[2]), n=1) if choice else []
+        meant = f"did you mean {near[0]}? " if near else ""
+        raise ConfigError(f"{self.prog}: {message} ({meant}see {self.prog} --help)")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -138,10 +143,12 @@ def _run(arguments: list[str]) -> int:
     parser, commands = _parser()
     options, unknown = parser.parse_known_args(words)
     for word in unknown:
-        allowed = re.findall(r"--[a-z-]+", commands[options.command].format_help() if options.command else "")
+        asked = commands[options.command] if options.command else parser
+        allowed = re.findall(r"--[a-z-]+", asked.format_help())
         near = difflib.get_close_matches(word.partition("=")[0].replace("_", "-"), allowed, n=1)
         meant = f" (did you mean {near[0]}?)" if near and word.startswith("-") else ""
-        raise ConfigError(f"{word}: unknown argument{meant}; settings are given as --section.key VALUE")
+        how = "" if options.command in (None, *_WITHOUT_SETTINGS) else "; settings are given as --section.key VALUE"
+        raise ConfigError(f"{word}: unknown argument{meant}{how}")
     if options.command is None:
         parser.print_help()
         return 0

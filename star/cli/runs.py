@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
-from star.config import kinds
+from star.config import loading
 from star.config.kinds import Kind
 from star.config.loading import experiment_of
 from star.config.section import ConfigError
@@ -63,4 +63,4 @@ def kind_of(runs: Sequence[Path], command: str) -> Kind:
     for run, name in zip(runs, names, strict=True):
         if name != names[0]:
             raise ConfigError(f"{run}: is of experiment {name}, {runs[0]} of {names[0]}; star {command} takes one kind")
-    return kinds.find(names[0])
+    return loading.kind_of(runs[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -43,7 +44,10 @@ def load(
     """
     values: dict[str, Any] = {}
     for file in (path, *layers):
-        read = read_file(shipped.find(Path(file)))
+        found = shipped.find(Path(file))
+        if os.path.isfile(found / "config.yaml"):
+            raise ConfigError(f"{file}: is a run, not a config; did you mean --resume {file}, or {file}/config.yaml?")
+        read = read_file(found)
         if {"config", "parameters"} <= set(read):
             raise ConfigError(f"{file}: is a sweep file, for star sweep")
         values = _merged(values, read)
@@ -55,6 +59,15 @@ def experiment_of(run_dir: Path) -> str:
     return read_file(_config_file(run_dir)).get("experiment", DEFAULT)
 
 
+def kind_of(run_dir: Path) -> kinds.Kind:
+    """The kind of the experiment of a run; raises `UserError` that names the run."""
+    try:
+        return kinds.find(experiment_of(run_dir))
+    except UserError as error:
+        named = str(error).startswith(str(run_dir))
+        raise ConfigError(str(error) if named else f"{_config_file(run_dir)}: {error}") from None
+
+
 def load_run(run_dir: Path, overrides: Mapping[str, Any]) -> Any:
     """The settings of a run, with others in their place; raises `UserError`."""
     path = _config_file(run_dir)
@@ -63,7 +76,7 @@ def load_run(run_dir: Path, overrides: Mapping[str, Any]) -> Any:
 
 def load_to_act(run_dir: Path, overrides: Mapping[str, Any]) -> Any:
     """Those of a run whose agents act on this machine, whatever they were trained on; raises `UserError`."""
-    anywhere = kinds.find(experiment_of(run_dir)).anywhere
+    anywhere = kind_of(run_dir).anywhere
     return load_run(run_dir, {"trainer.devices": 1} | dict(anywhere) | dict(overrides))
 
 
@@ -72,6 +85,8 @@ def _config_file(run_dir: Path) -> Path:
     try:
         if not run_dir.exists():
             raise ConfigError(f"{run_dir}: is not a run directory, there is nothing of this name")
+        if run_dir.is_file():
+            raise ConfigError(f"{run_dir}: is a file, not a run directory")
         if not path.is_file():
             raise ConfigError(f"{run_dir}: is not a run directory, it holds no config.yaml")
     except OSError as error:
@@ -130,16 +145,33 @@ def parse(
     try:
         kind = kinds.find(nested.get("experiment", DEFAULT))
     except UserError as error:
-        raise ConfigError(f"{source}: {error}") from None
+        culprit = typed if "experiment" in (overrides or {}) else source
+        raise ConfigError(f"{culprit}: {error}") from None
     model = kind.Config
     if kept:
         nested = _merged(_with_overrides({}, kind.older), nested)
     try:
         return model.model_validate(nested)
     except ValidationError as error:
-        first = error.errors()[0]
-        culprit = typed if _is_among(overrides or {}, first["loc"]) else source
-        raise ConfigError(f"{culprit}: {explain(first, model)}") from None
+        first = first_of(error)
+        mine = _is_among(overrides or {}, first["loc"]) or (not first["loc"] and overrides and _fits(values, model))
+        raise ConfigError(f"{typed if mine else source}: {explain(first, model)}") from None
+
+
+def first_of(error: ValidationError) -> ErrorDetails:
+    """The error to tell of: the first, but a key that is unknown rather than one that is missing for it."""
+    found = error.errors()
+    unknown = [one for one in found if one["type"] == "extra_forbidden"]
+    return unknown[0] if unknown and found[0]["type"] == "missing" else found[0]
+
+
+def _fits(values: Mapping[str, Any], model: type[BaseModel]) -> bool:
+    """Whether these values go together by themselves."""
+    try:
+        model.model_validate(plain(values))
+    except ValidationError:
+        return False
+    return True
 
 
 def _is_among(overrides: Mapping[str, Any], place: Sequence[str | int]) -> bool:
@@ -209,6 +241,11 @@ _PLAIN = {
     r"a valid dictionary( or instance of \w+)?": "a mapping such as {key: value}",
     "a valid boolean(, unable to interpret input)?": "true or false",
     "False, True": "false, true",
+    r"a valid integer(, (unable to parse.*|got a number with a fractional part))?": "a whole number",
+    r"[Uu]nable to parse input string as an integer, exceeded maximum size": "should be a smaller whole number",
+    r"a valid number(, unable to parse.*)?": "a number",
+    "greater than or equal to": "at least",
+    "less than or equal to": "at most",
 }  # pydantic's words (regular expressions), and what users of YAML say
 
 
@@ -218,12 +255,18 @@ def explain(error: ErrorDetails, model: type[BaseModel]) -> str:
     key = ".".join(path)
     if error["type"] == "extra_forbidden":
         return f"{key}: unknown key{_nearest_key(path, model)}"
+    if error["type"] == "missing":
+        return f"{key}: is missing"
     message = error["msg"].removeprefix("Value error, ").replace("Input should be", "should be")
     for words, ours in _PLAIN.items():
         message = re.sub(words, ours, message)
     message = message[:1].lower() + message[1:]
     if error["type"] == "value_error" and not isinstance(error["input"], str | int | float | bool):
         return f"{key}: {message}" if key else message
+    if error["type"] == "literal_error":
+        choices = re.findall(r"'(.*?)'", error.get("ctx", {}).get("expected", ""))
+        near = difflib.get_close_matches(str(error["input"]), choices, n=1)
+        message += f" (did you mean {near[0]}?)" if near else ""
     return f"{key}: {shown(error['input'])} is not allowed: {message}" if key else message
 
 

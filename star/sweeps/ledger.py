@@ -32,6 +32,7 @@ from optuna.study import StudyDirection
 from optuna.trial import FrozenTrial, Trial, TrialState
 from sqlalchemy.pool import NullPool
 
+from envs.common import extras
 from star.config.section import ConfigError
 
 RETRIES = 3
@@ -296,7 +297,7 @@ def reachable(url: sqlalchemy.URL | str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise ConfigError(f'{shown}: needs {error.name}; install it with pip install "star-rl[postgres]"') from None
+        raise ConfigError(f"{shown}: needs {error.name}; install it with {extras.install('postgres')}") from None
     except (sqlalchemy.exc.SQLAlchemyError, optuna.exceptions.StorageInternalError, RuntimeError) as error:
         cause = getattr(error, "orig", None) or error.__cause__ or error
         message = " ".join(str(getattr(cause, "orig", cause)).split())

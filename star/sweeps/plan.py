@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from envs.common.errors import shown
 from star.config import kinds, shipped
 from star.config.kinds import Kind, Measure
-from star.config.loading import check_setting, explain, flat, load, parse, read_file, type_of
+from star.config.loading import check_setting, explain, first_of, flat, load, parse, read_file, type_of
 from star.config.run import RunConfig
 from star.config.section import ConfigError, Positive
 from star.sweeps.ledger import product
@@ -176,7 +176,7 @@ def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: An
     try:
         sweep = Sweep.model_validate(values | changes)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {explain(error.errors()[0], Sweep)}") from None
+        raise ConfigError(f"{path}: {explain(first_of(error), Sweep)}") from None
     folder = path.parent
     base = load(
         shipped.find(sweep.config, beside=folder),

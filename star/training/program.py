@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.common import modes
+from envs.common import extras, modes
 from star import devices
 from star.config import kinds
 from star.config.kinds import Kind
@@ -138,7 +138,7 @@ def select_device(device: str) -> None:
     if device == "gpu" and jax.default_backend() != "gpu":
         raise ConfigError(
             f"trainer.device: 'gpu' is not available, JAX sees only {jax.default_backend()}; "
-            'install with pip install "star-rl[cuda,warp]" on a machine with an NVIDIA GPU, or use auto or cpu'
+            f"on a machine with an NVIDIA GPU {extras.install('cuda', 'warp')}, or use auto or cpu"
         )
 
 

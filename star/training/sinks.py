@@ -20,6 +20,7 @@ from operator import methodcaller
 from pathlib import Path
 from typing import Any, Protocol, Self
 
+from envs.common import extras
 from star.config.run import RunConfig
 from star.config.section import ConfigError
 from star.training.journal import by_step, mean
@@ -263,7 +264,7 @@ def check(config: RunConfig) -> None:
     """Raise `UserError` if a package that a sink of `config` needs is not installed."""
     for name in config.trainer.sinks:
         if name in _EXTRAS and importlib.util.find_spec(name) is None:
-            raise ConfigError(f'trainer.sinks: {name} is not installed; install it with pip install "star-rl[{name}]"')
+            raise ConfigError(f"trainer.sinks: {name} is not installed; install it with {extras.install(name)}")
 
 
 def numbers(rows: Sequence[Row]) -> dict[str, float]:

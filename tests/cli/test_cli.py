@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
 import pytest
 
 import envs
@@ -17,31 +16,10 @@ from star.cli.words import split_settings
 from star.config import described
 from star.config.loading import fields
 from star.training import trainer
+from tests.cli.refused import refusal
 
 ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    """An empty working directory with three config files and one run."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "point.yaml").write_text("env: {name: point_maze}\ntrainer: {num_envs: 8}\n")
-    (tmp_path / "ant.yaml").write_text("env: {name: ant_maze}\ntrainer: {num_envs: 8}\n")
-    (tmp_path / "old.png").write_text("precious")
-    (tmp_path / "old.npz").write_text("precious")
-    (tmp_path / "old.html").write_text("precious")
-    (tmp_path / "broken.yaml").write_text("tutor:\n  period: [5\ntrainer: {}\n")
-    run = tmp_path / "runs" / "old"
-    run.mkdir(parents=True)
-    (run / "config.yaml").write_text(Config().to_yaml())
-    return tmp_path
-
-
-@pytest.fixture
-def bare(monkeypatch):
-    """A machine without a GPU and without Warp."""
-    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
-    monkeypatch.setitem(sys.modules, "warp", None)
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 @pytest.fixture
@@ -76,144 +54,6 @@ def test_a_table_names_runs_as_they_are_called(capsys):
     exam_tables.show([evaluation(name, env_steps=10) for name in names], None, again="")
     shown = capsys.readouterr().out
     assert all(name in shown for name in names)
-
-
-def contents(folder):
-    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
-
-
-def refusal(capsys, folder, arguments):
-    """What a command that fails says: exit code 2, one line on stderr, nothing on stdout, nothing written."""
-    before = contents(folder)
-    assert main(arguments) == 2
-    out, err = capsys.readouterr()
-    assert out == "" and contents(folder) == before
-    assert err.startswith("error: ") and err.endswith("\n") and err.count("\n") == 1
-    return err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        pytest.param("train point.yaml --commander.perod 5", "commander.period?", id="misspelt key"),
-        pytest.param("trian point.yaml", "star: 'trian' is no command (did you mean star train?)", id="command"),
-        pytest.param("practise point.yaml", "'practise' is no command (allowed: train, sweep, ", id="no command"),
-        pytest.param("train point.yaml tutor.perod=5", "command line: tutor.perod: unknown key", id="misspelt word"),
-        pytest.param("train point.yaml tutor.period=x", "command line: tutor.period: 'x' is not", id="value of a word"),
-        pytest.param("train pointmaze", "pointmaze: no such file (did you mean point_maze?)", id="name of a config"),
-        pytest.param("train point.yaml --with agents/hiros", "(did you mean agents/hiro?)", id="name of a layer"),
-        pytest.param("train sweeps/point_maze", "is a sweep file, for star sweep", id="sweep as a config"),
-        pytest.param("sweep point_maze", "point_maze.yaml: is no sweep file", id="config as a sweep"),
-        pytest.param("configs arm", "arm: no config has this in its name", id="no such configs"),
-        pytest.param("ls nowhere", "nowhere: cannot be read: No such file", id="runs of no folder"),
-        pytest.param("train point.yaml --dry-run --tutor.period 7", "not a multiple", id="dry run of what is refused"),
-        pytest.param("train point.yaml --with no.yaml", "no.yaml: no such file", id="missing layer"),
-        pytest.param(
-            "train --resume run --with point.yaml", "--with: a resumed run keeps", id="layer on a resumed run"
-        ),
-        pytest.param("train point.yaml --comander.period 5", "commander?", id="misspelt section"),
-        pytest.param("train point.yaml --tutor.period ten", "tutor.period: 'ten' is not allowed", id="wrong type"),
-        pytest.param("train point.yaml --tutor.ppo 5", "tutor.ppo: 5 is not allowed", id="section as a value"),
-        pytest.param("train point.yaml --commander.learning_rate nan", "finite", id="not a number"),
-        pytest.param("train point.yaml --trainer.num_envs true", "trainer.num_envs: true", id="boolean as a number"),
-        pytest.param("train point.yaml --commander.discount -1", "commander.discount: -1", id="out of range"),
-        pytest.param("train point.yaml --seeds 0", "trainer.num_seeds: 0", id="no seeds"),
-        pytest.param("train point.yaml --tutor.period 7", "not a multiple", id="periods that do not fit"),
-        pytest.param("train point.yaml --tutor.period", "--tutor.period: needs a value", id="no value"),
-        pytest.param("train point.yaml --trainer.sinks tensorboard", "should be a list", id="sinks not a list"),
-        pytest.param("train point.yaml --trainer.sinks [mlflow]", "'tensorboard' or 'wandb'", id="unknown sink"),
-        pytest.param("train point.yaml --trainer.sinks [wandb,wandb]", "sinks: wandb is given twice", id="sink twice"),
-        pytest.param("train point.yaml --profile 0", "--profile: '0' is not a whole number from 1", id="profile none"),
-        pytest.param("train --profile point.yaml", "--profile: 'point.yaml' is not a whole", id="profile a file"),
-        pytest.param("train point.yml", "did you mean point.yaml?", id="missing config"),
-        pytest.param("train broken.yaml", "broken.yaml: line 3", id="broken config"),
-        pytest.param("train point.yaml --bogus", "--bogus: unknown argument", id="unknown flag"),
-        pytest.param("train point.yaml --tutor 5", "--tutor: unknown argument", id="flag without a dot"),
-        pytest.param("train point.yaml --run_dir new", "(did you mean --run-dir?)", id="misspelt flag"),
-        pytest.param("train point.yaml --trainer.seed --quiet", "--trainer.seed: needs a value", id="no value"),
-        pytest.param("train point.yaml more", "more: unknown argument", id="too many arguments"),
-        pytest.param("train", "either a config file or --resume", id="neither config nor resume"),
-        pytest.param("train point.yaml --resume runs/old", "either a config file or --resume", id="both"),
-        pytest.param("train --resume runs/new", "runs/new: is not a run directory", id="resume of a non-run"),
-        pytest.param("train --resume runs/old --run-dir a", "--run-dir", id="resume elsewhere"),
-        pytest.param("evaluate runs/new", "runs/new: is not a run directory", id="evaluate a non-run"),
-        pytest.param("evaluate runs/old", "runs/old: holds no checkpoint", id="evaluate without checkpoint"),
-        pytest.param("evaluate", "give a RUN, or --group", id="evaluate nothing"),
-        pytest.param("evaluate runs", "runs: is not a run directory, it holds no config", id="evaluate a folder"),
-        pytest.param("evaluate runs/old/checkpoints/5", "runs/old: holds no checkpoint", id="evaluate no such steps"),
-        pytest.param("evaluate runs/old --group a=", "--group: 'a=' is not of the form", id="empty group"),
-        pytest.param("evaluate --group a=runs/old --group b=runs/old", "both in a and in b", id="two groups"),
-        pytest.param("evaluate --group a=runs/old --group a=runs/x", "--group: a is given twice", id="group twice"),
-        pytest.param("evaluate --group a=runs/x", "runs/x: is not a run directory", id="group of a non-run"),
-        pytest.param("evaluate runs/old --grid 4", "--grid: needs --goals grid", id="grid without goals"),
-        pytest.param("evaluate runs/old --goals grid --grid 65", "from 1 to 64", id="huge grid"),
-        pytest.param("evaluate runs/old --out old.png", "old.png is a file, not a folder", id="evaluate into a file"),
-        pytest.param("evaluate runs/old --episodes x", "trainer.eval_episodes: 'x'", id="episodes not a number"),
-        pytest.param("evaluate runs/old --evaluation-seed x", "--evaluation-seed", id="seed not a number"),
-        pytest.param("render", "required: --out", id="render nothing"),
-        pytest.param("render --out a.png", "give a task, or --run RUN", id="render neither task nor run"),
-        pytest.param("render point_maze --out a.avi", "a.avi: cannot tell what to write", id="render an odd ending"),
-        pytest.param("render point_maze --out a/b.png", "there is no folder a", id="render into no folder"),
-        pytest.param("render point_maze --out runs", "runs: is a folder", id="render over a folder"),
-        pytest.param("render point_maze --out old.png", "old.png: exists; replace it with --force", id="render over"),
-        pytest.param("render point_maze --out a.png --seed 1", "--seed: needs --run", id="render seed without run"),
-        pytest.param("render point_maze --out a.png --checkpoint best", "--checkpoint: needs --run", id="no run"),
-        pytest.param("render point_maze --out a.png --episode 1", "--episode: needs --run", id="episode of no run"),
-        pytest.param("render point_maze --out a.png --goals grid", "--goals: grid needs --run", id="grid of no run"),
-        pytest.param("render --run runs/old --out a.png --goals grid", "need --episode K", id="render only a grid"),
-        pytest.param("render --run runs/old --out a.png --episode 1 --envs 2", "so --envs", id="episodes of one"),
-        pytest.param("render point_maze --out a.png --tutor.period 5", "--tutor.period: random", id="render settings"),
-        pytest.param("render point_maze --out a.gif --envs 26", "from 1 to 25", id="render too many"),
-        pytest.param("render point_maze --out a.gif --every 0", "from 1 to", id="render every 0th"),
-        pytest.param("render point_maze --out a.gif --camera folow", "choose from", id="render unknown camera"),
-        pytest.param("render --run runs/new --out a.gif", "runs/new: is not a run directory", id="render a non-run"),
-        pytest.param("record runs/old", "required: --out", id="record into nothing"),
-        pytest.param("record --out a.npz", "required: run", id="record nothing"),
-        pytest.param("record runs/new --out a.npz", "runs/new: is not a run directory", id="record a non-run"),
-        pytest.param("record runs/old --out a.npz", "runs/old: holds no checkpoint", id="record without checkpoint"),
-        pytest.param("record runs/old --out a.csv", "a.csv: cannot tell what to write", id="record an odd ending"),
-        pytest.param("record runs/old --out a/b.npz", "there is no folder a", id="record into no folder"),
-        pytest.param("record runs/old --out old.npz", "old.npz: exists; replace it with --force", id="record over"),
-        pytest.param("record runs/old --out a.npz --episodes 0", "from 1 to 10000", id="record no episode"),
-        pytest.param("report runs/old", "required: --out", id="report into nothing"),
-        pytest.param("report --out a.html", "star report: give a RUN, or --group", id="report nothing"),
-        pytest.param("report runs/new --out a.html", "runs/new: is not a run directory", id="report a non-run"),
-        pytest.param("report runs/old --out a.html", "runs/old: its metrics.jsonl holds no", id="report an empty run"),
-        pytest.param("report runs/old runs/../runs/old --out a.html", "is given twice", id="report a run twice"),
-        pytest.param("report runs/old --out a.pdf", "a.pdf: cannot tell what to write", id="report an odd ending"),
-        pytest.param("report runs/old --out a/b.html", "there is no folder a", id="report into no folder"),
-        pytest.param("report runs/old --out old.html", "old.html: exists; replace it with --force", id="report over"),
-        pytest.param("report runs/old --out a.html --tutor.period 5", "takes no settings", id="report with a setting"),
-        pytest.param(
-            "settings tutr",
-            "tutr: no setting has this in its key or its text (did you mean tutor?)",
-            id="unknown setting",
-        ),
-        pytest.param("settings --tutor.period=5", "takes no settings", id="settings with a setting"),
-        pytest.param("envs --tutor.period 5", "takes no settings", id="envs with a setting"),
-    ],
-)
-def test_bad_input_is_one_line_and_nothing_is_written(capsys, folder, arguments, said):
-    assert said in refusal(capsys, folder, arguments.split())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        pytest.param("train ant.yaml --env.engine warp", 'pip install "star-rl[warp]"', id="engine"),
-        pytest.param(
-            "train point.yaml --env.engine native", 'engine "native" is not one of point_maze', id="no engine"
-        ),
-        pytest.param("train point.yaml --trainer.device gpu", 'pip install "star-rl[cuda,warp]"', id="device"),
-        pytest.param("train point.yaml --env.name point_mase", 'did you mean "point_maze"?', id="task"),
-        pytest.param("train point.yaml --env.options.presett fast", 'option "presett"', id="option"),
-        pytest.param("train point.yaml --env.options.episode_length -5", "episode_length", id="value of an option"),
-        pytest.param("train point.yaml --abstraction.cuts [[50],[8]]", "abstraction.cuts: [50.0]", id="cuts"),
-        pytest.param("train point.yaml --tutor.unroll 7", "tutor.unroll: 7 does not divide", id="unroll"),
-    ],
-)
-def test_what_machine_or_task_cannot_do_is_one_line_and_nothing_is_written(capsys, folder, bare, arguments, said):
-    assert said in refusal(capsys, folder, [*arguments.split(), "--run-dir", "new"])
 
 
 def test_a_run_never_writes_over_another(capsys, folder):

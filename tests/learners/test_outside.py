@@ -73,7 +73,7 @@ def test_it_trains_checkpoints_and_resumes_bit_for_bit(here, monkeypatch, capsys
     [
         (["--controller.own.stds", "1"], "controller.own: 'stds' is no setting of mine:reinforce; allowed: learning_"),
         (["--controller.own.std", "0"], "controller.own.std: 0 is not allowed: should be greater than 0"),
-        (["--controller.own.std", "wide"], "controller.own.std: 'wide' is not allowed: should be a valid number"),
+        (["--controller.own.std", "wide"], "controller.own.std: 'wide' is not allowed: should be a number"),
         (["--controller.hindsight", "true"], "controller: hindsight needs learner td3, which replays"),
         (["--controller.learner", "mine:other"], "mine holds no other; allowed: a star.learners.protocol.Learner"),
         (["--controller.learner", "mine:Config"], "is a class; allowed: a star.learners.protocol.Learner"),

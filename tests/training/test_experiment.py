@@ -194,7 +194,7 @@ def test_what_was_not_measured_is_worst(better):
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--learning.step_size", "2"], "learning.step_size: 2 is not allowed: should be less than or equal to 1"),
+        (["--learning.step_size", "2"], "learning.step_size: 2 is not allowed: should be at most 1"),
         (["--learning.stepsize", "1"], "learning.stepsize: unknown key (did you mean learning.step_size?)"),
         (["--tutor.period", "3"], "tutor: unknown key, it is one of experiment star (allowed: experiment, learning, "),
         (["--experiment", "sta"], "experiment: 'sta' is not allowed: should be star or module:name (did you mean star"),
