@@ -15,11 +15,15 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from star import _neighbour
+
 if TYPE_CHECKING:
     from star.api import evaluate, load, train
 
 __all__ = ["evaluate", "load", "train"]
 __version__ = "0.1.0"
+
+_neighbour.check()
 
 
 def __getattr__(name: str) -> Any:

@@ -2,6 +2,9 @@
 
 import fcntl
 import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -46,6 +49,34 @@ def test_a_file_goes_before_a_config_of_its_name_and_a_folder_does_not(folder):
 def test_the_wheel_holds_the_configs_where_they_are_looked_for():
     wheel = (ROOT / "pyproject.toml").read_text()
     assert '"configs" = "star/configs"' in wheel and shipped.__file__ == str(ROOT / "star/config/shipped.py")
+
+
+@pytest.mark.parametrize("name", ["envs/__init__.py", "envs.py"])
+@pytest.mark.parametrize("words", [["-m", "star", "envs"], ["script.py"], ["deep.py"]], ids=" ".join)
+def test_a_users_own_envs_in_the_place_of_ours_is_told_in_one_line(name, words, folder):
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).write_text("mine = 1\n")
+    (folder / "script.py").write_text("import envs\nprint(envs.mine)\nimport star\n")
+    (folder / "deep.py").write_text("from star.config.loading import load\n")
+    done = subprocess.run(
+        [sys.executable, *words], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    *before, said = done.stderr.splitlines()
+    place = folder / name.split("/")[0]
+    line = (
+        f"{folder / name}: is imported as envs, in the place of {ROOT}/envs; rename {place}, or work in another folder"
+    )
+    if words[0] == "-m":
+        assert (done.returncode, before, said, done.stdout) == (2, [], f"error: {line}", "")
+    else:
+        assert (done.returncode, said) == (1, f"ImportError: {line}")
+
+
+def test_a_folder_envs_that_is_no_package_is_in_nobodys_place(folder):
+    (folder / "envs").mkdir()
+    command = [sys.executable, "-m", "star", "--version"]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("word", ["--tutor.period 5", "--tutor.period=5", "tutor.period=5"])

@@ -199,6 +199,6 @@ def test_a_sink_that_hangs_holds_up_neither_the_training_nor_its_end(monkeypatch
 
 def test_a_package_that_is_not_installed_is_named_with_what_to_install(monkeypatch):
     monkeypatch.setattr(sinks.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r"^trainer.sinks: wandb is not installed; install it with pip install .*\[wandb\]'$"):
+    with pytest.raises(UserError, match=r"^trainer.sinks: wandb is not installed; install it with pip .*\[wandb\]'$"):
         sinks.check(settings("tensorboard", "wandb"))
     sinks.check(settings("tensorboard"))
