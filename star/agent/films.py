@@ -7,6 +7,7 @@ write     .png, .jpg, .mp4, .gif or .html
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,7 @@ from star.agent.sections import Config
 from star.config.section import ConfigError
 from star.training import program as programs
 from star.training.checkpoint import agent_number, load_state
+from star.training.console import Elapsed
 
 MAX_ENVS = 25
 HEIGHTS = ((1, 480), (4, 320), (9, 240), (MAX_ENVS, 180))  # pixels of a tile, by the number of environments
@@ -102,7 +104,7 @@ def render(
       UserError: in one line, for whatever cannot be had; nothing is written then.
     """
     with _progress(Console(stderr=True), quiet) as progress:
-        task = progress.add_task("recording", total=None)
+        task = progress.add_task("recording", total=None, since=time.monotonic())
         if run_dir is None:
             recording = record_random(config, envs=show.envs, steps=show.steps, seed=exam.seed)
         else:
@@ -117,7 +119,7 @@ def render(
                 number=episode,
             )
         times = moments_shown(len(recording.moments.obs), show)
-        progress.update(task, description="drawing", total=len(times))
+        progress.update(task, description="drawing", total=len(times), since=None)
         pictures = _ticking(draw(recording, show, times), progress, task)
         written = video.write(show.out, pictures, fps=show.fps)
     return f"{show.out}: {written} picture{'s' * (written > 1)}; {_outcome(recording)}"
@@ -288,6 +290,7 @@ def _progress(console: Console, quiet: bool) -> Progress:
         TextColumn("{task.description}"),
         BarColumn(),
         TaskProgressColumn(),
+        Elapsed(),
         TimeRemainingColumn(compact=True),
         console=console,
         transient=True,

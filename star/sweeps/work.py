@@ -37,6 +37,7 @@ from star.sweeps.ledger import MEASURED, Cmaes, Holding, Ledger, reachable, reas
 from star.sweeps.plan import Plan, Sweep
 from star.training import faults
 from star.training import program as programs
+from star.training.console import Elapsed
 from star.training.journal import mean
 from star.training.side_by_side import SideBySide
 from star.training.signals import interruptible
@@ -198,7 +199,7 @@ class _Worker:
         """Train the queued trials that have the structure of the first, and such as come until there are too few."""
         shared = programs.structure(self.queue[0].config)
         slots = dict(enumerate(self._from_queue(shared)))
-        self.display.update(status=f"compiling for {len(slots)} trials side by side")
+        self.display.update(status=f"compiling for {len(slots)} trials side by side", timed=True)
         try:
             self._train(self.make(slots[0].config, len(slots)), slots, shared)
         except UserError as error:
@@ -306,12 +307,14 @@ class _Display:
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[status]}"),
+            Elapsed(),
             TimeRemainingColumn(compact=True),
             console=console,
             disable=quiet or not console.is_terminal,
         )
         self._ended, self._under_way, self._status = 0, 0.0, ""
-        self._task = self._progress.add_task("", total=trials, status="")
+        self._since: float | None = None
+        self._task = self._progress.add_task("", total=trials, status="", since=None)
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -320,12 +323,24 @@ class _Display:
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def update(self, *, ended: int | None = None, under_way: float | None = None, status: str | None = None) -> None:
-        """Show how many trials have ended and how many more those under way make, in parts of a trial."""
+    def update(
+        self,
+        *,
+        ended: int | None = None,
+        under_way: float | None = None,
+        status: str | None = None,
+        timed: bool = False,
+    ) -> None:
+        """Show how many trials have ended and how many more those under way make, in parts of a trial.
+
+        Beside a `timed` status stands the time since it began.
+        """
         self._ended = self._ended if ended is None else ended
         self._under_way = self._under_way if under_way is None else under_way
-        self._status = self._status if status is None else status
-        self._progress.update(self._task, completed=self._ended + self._under_way, status=self._status)
+        if status is not None:
+            self._status, self._since = status, time.monotonic() if timed else None
+        completed = self._ended + self._under_way
+        self._progress.update(self._task, completed=completed, status=self._status, since=self._since)
 
 
 def _row(found: Plan, trial: FrozenTrial) -> dict[str, Any]:

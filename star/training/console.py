@@ -16,6 +16,7 @@ from rich import box
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.panel import Panel
+from rich.progress import ProgressColumn, Task
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
@@ -207,6 +208,19 @@ def sparkline(values: Sequence[float], *, share: bool = True, width: int = 12) -
         numbers = (numbers - numbers.min()) / max(float(np.ptp(numbers)), 1e-12)
     parts = np.array_split(np.clip(numbers, 0, 1), min(width, len(numbers)))
     return "".join(_BARS[min(int(part.mean() * len(_BARS)), len(_BARS) - 1)] for part in parts)
+
+
+class Elapsed(ProgressColumn):
+    """In a bar: how long the task has done what it does since `task.fields["since"]`, if that is not None."""
+
+    def __init__(self, *, now: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._now = now
+
+    def render(self, task: Task) -> Text:
+        """The time as `clock` has it."""
+        since = task.fields["since"]
+        return Text("" if since is None else clock(self._now() - since))
 
 
 def clock(seconds: float) -> str:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 import envs
 from envs import EnvError, opengl
@@ -192,6 +196,25 @@ def test_what_cannot_be_drawn_is_told_in_one_line_and_nothing_is_written(
     assert cli.main(words) == 2
     out, err = capsys.readouterr()
     assert said in err and err.count("\n") == 1 and out == "" and not list(tmp_path.iterdir())
+
+
+def test_a_bar_moves_while_pictures_are_drawn(tmp_path, monkeypatch):
+    screen, blank = io.StringIO(), np.zeros((2, 2, 3), np.uint8)
+
+    def draw(recording, show, times):
+        for _ in times:
+            time.sleep(0.15)  # longer than the bar takes to be drawn again
+            yield blank
+
+    recording = SimpleNamespace(moments=SimpleNamespace(obs=np.zeros((9, 1)), success=np.zeros((9, 1))))
+    terminal = Console(file=screen, force_terminal=True, width=100, color_system=None)
+    monkeypatch.setattr(films, "Console", lambda stderr: terminal)
+    monkeypatch.setattr(films, "record_random", lambda *_, **__: time.sleep(0.3) or recording)
+    monkeypatch.setattr(films, "draw", draw)
+    films.render(parse({}), Show(out=tmp_path / "a.gif"))
+    assert re.search(r"recording .* 0:00", screen.getvalue())
+    shares = [int(share) for share in re.findall(r"drawing .*?(\d+)%", screen.getvalue())]
+    assert shares == sorted(shares) and len(set(shares)) >= 4
 
 
 def test_without_opengl_the_command_says_so_before_anything_is_recorded(tmp_path, monkeypatch, capsys):

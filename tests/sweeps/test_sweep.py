@@ -10,6 +10,7 @@ import json
 import os
 import pickle
 import pwd
+import re
 import shutil
 import signal
 import sqlite3
@@ -251,6 +252,25 @@ def test_a_broken_trial_is_recorded_with_its_reason_and_the_rest_goes_on(folder)
     assert reasons[0] == "" and reasons[1] == "RuntimeError: RESOURCE_EXHAUSTED: out of memory"
     assert sum("controller/actor_loss is not finite at 240 env steps" in one for one in reasons) == 1
     assert sum("controller.ppo.minibatches: 7 does not divide" in one for one in reasons) == 4
+
+
+def test_the_time_is_shown_while_a_program_compiles_and_not_while_trials_run(folder):
+    class Slow(Stub):
+        def put(self, runs):
+            time.sleep(0.3)  # as long as the bar takes to be drawn again
+            super().put(runs)
+
+        def advance(self):
+            time.sleep(0.15)
+            return super().advance()
+
+    screen = io.StringIO()
+    console = Console(file=screen, force_terminal=True, width=120, color_system=None)
+    found = plan(written())
+    with contextlib.closing(open_ledger(found, "sqlite:///shown.db")) as ledger:
+        assert work(found, ledger, make=Slow, quiet=False, console=console)
+    assert re.search(r"compiling for \d+ trials side by side\s+0:0\d ", screen.getvalue())
+    assert re.search(r"running  [\d,]+ env steps/s\s+-?[-\d]", screen.getvalue())
 
 
 def test_an_interrupted_sweep_gives_its_trials_back_and_goes_on_where_it_was(folder, monkeypatch):
