@@ -159,8 +159,20 @@ def test_the_commands_of_the_tutorial_work_as_they_are_but_smaller(run, tmp_path
 def test_the_pages_show_how_to_train_resume_evaluate_and_look_things_up():
     shown = {tuple(one.values[0][1:3]) for one in STAR}
     assert ("train", "configs/point_maze.yaml") in shown and ("train", "--resume") in shown
-    words = {"train", "sweep", "ls", "evaluate", "render", "record", "report", "settings", "configs", "envs"}
-    assert words == {words[0] for words in shown}
+    words = {
+        "train",
+        "sweep",
+        "ls",
+        "evaluate",
+        "render",
+        "record",
+        "report",
+        "settings",
+        "configs",
+        "envs",
+        "completion",
+    }
+    assert words | {"completion"} == {words[0] for words in shown}
 
 
 @pytest.mark.parametrize("words", MAKE)

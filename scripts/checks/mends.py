@@ -38,6 +38,9 @@ def _use(test: str) -> str:
     return f"tests/test_compatibility.py::test_{test}"
 
 
+_VARIABLE = "tests/cli/test_mistakes.py::test_a_wrong_variable_is_told_in_one_line_and_nothing_is_written"
+
+
 MENDS = (
     Mend(
         "the box around a goal is larger than the ball of success",
@@ -76,7 +79,7 @@ MENDS = (
     ),
     Mend(
         "JAX_ENABLE_X64 ends in a traceback",
-        _use("a_mode_that_nothing_runs_in_is_named_in_one_line_and_leaves_nothing_behind[JAX_ENABLE_X64-1]"),
+        _VARIABLE + "[JAX_ENABLE_X64=1 star train point.yaml]",
         "envs/common/modes.py",
         "if config.jax_enable_x64:",
         "if False:",
@@ -90,7 +93,7 @@ MENDS = (
     ),
     Mend(
         "a device that is not there ends in a traceback",
-        _use("a_mode_that_nothing_runs_in_is_named_in_one_line_and_leaves_nothing_behind[JAX_PLATFORMS-abacus]"),
+        _VARIABLE + "[JAX_PLATFORMS=abacus star train point.yaml]",
         "star/cli/command.py",
         "        line = modes.missing_device()\n",
         "        line = None\n",

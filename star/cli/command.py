@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 from envs.common import modes
 from envs.common.errors import Notice, UserError
 from star import __version__
-from star.cli import configs, envs, evaluate, ls, record, render, report, settings, sweep, train
+from star.cli import completion, configs, envs, evaluate, ls, record, render, report, settings, sweep, train
 from star.cli.streams import unbroken
 from star.cli.words import split_settings, value
 from star.config import plugins
@@ -34,10 +34,11 @@ COMMANDS: Mapping[str, ModuleType] = {
     "configs": configs,
     "envs": envs,
     "settings": settings,
+    "completion": completion,
 }
 """Each has `HELP`, `DESCRIPTION`, `add(parser)` and `run(options, overrides)`, which returns the exit code."""
 
-_WITHOUT_SETTINGS = ("ls", "report", "configs", "envs", "settings")
+_WITHOUT_SETTINGS = ("ls", "report", "configs", "envs", "settings", "completion")
 
 _HELP = """\
 Train a three-level agent (Commander, Tutor, Controller) whose goal regions refine themselves.
@@ -57,7 +58,8 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star report runs/A runs/B --out report.html   curves, regions and settings of runs, as one page
   star configs                                  the configs that come with STAR
   star envs                                     the tasks
-  star settings [PREFIX]                        every setting, its default and its meaning
+  star settings [WORD]                          every setting: meaning, range, unit and default
+  star completion bash                          completion with the Tab key
 """
 _LONGEST_ERROR = 1000  # characters
 
@@ -140,7 +142,7 @@ def _on_one_line(message: str) -> str:
 
 def _run(arguments: list[str]) -> int:
     words, overrides = split_settings(arguments)
-    parser, commands = _parser()
+    parser, commands = parsers()
     options, unknown = parser.parse_known_args(words)
     for word in unknown:
         asked = commands[options.command] if options.command else parser
@@ -163,7 +165,7 @@ def _run(arguments: list[str]) -> int:
     return options.function(options, flags | overrides)
 
 
-def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
+def parsers() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentParser]]:
     """That of `star`, and those of its commands."""
     shape: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter, "allow_abbrev": False}
     parser = _Parser(prog="star", description=_HELP, **shape)
@@ -173,7 +175,7 @@ def _parser() -> tuple[argparse.ArgumentParser, Mapping[str, argparse.ArgumentPa
         one = commands.add_parser(name, help=command.HELP, description=command.DESCRIPTION, **shape)
         command.add(one)
         one.set_defaults(function=command.run)
-        if name not in ("configs", "envs"):
+        if name not in ("configs", "envs", "completion"):
             one.add_argument(
                 "--import",
                 dest="modules",

@@ -42,6 +42,11 @@ class Setting:
         return self._extra("unit")
 
     @property
+    def choices(self) -> list[str]:
+        """All that it may be, in words, if they can be told."""
+        return _choices(self.field.annotation)
+
+    @property
     def allowed(self) -> str:
         """Its type, with the range or the choices, in words."""
         words = _words(self.field.annotation, self.field.metadata)
@@ -87,11 +92,11 @@ def _words(annotation: Any, checks: Sequence[Any]) -> str:
         inner = [_words(item, checks) for item in items if item is not NoneType]
         return ", ".join(inner) + ", or null" * (NoneType in items)
     if origin is Literal:
-        return f"one of {', '.join(item if isinstance(item, str) else json.dumps(item) for item in items)}"
+        return f"one of {', '.join(_choices(annotation))}"
     if origin is tuple:
         return f"list{_length(checks)}, each {_words(items[0], [])}"
     if annotation is bool:
-        return "true or false"
+        return " or ".join(_choices(annotation))
     if annotation is int:
         return f"whole number{_whole_range(checks)}"
     if annotation is float:
@@ -100,6 +105,12 @@ def _words(annotation: Any, checks: Sequence[Any]) -> str:
         pattern = _bound(checks, "pattern")
         return "text" if pattern is None else f"text like {pattern}"
     return "mapping"
+
+
+def _choices(annotation: Any) -> list[str]:
+    """Those of a `Literal` and of a bool, as YAML spells them."""
+    items = (True, False) if annotation is bool else get_args(annotation) if get_origin(annotation) is Literal else ()
+    return [item if isinstance(item, str) else json.dumps(item) for item in items]
 
 
 def _bound(checks: Sequence[Any], name: str) -> Any:

@@ -105,6 +105,7 @@ PRINTING = {
     "configs": "configs",
     "envs": "envs",
     "settings": "settings",
+    "completion": "completion bash",
     "help": "--help",
     "help of a command": "train --help",
     "version": "--version",
