@@ -318,14 +318,14 @@ MENDS = (
     Mend(
         "of two commands that start in one second one is lost",
         _use("two_commands_in_one_second_get_a_place_each"),
-        "star/cli/words.py",
+        "envs/common/files.py",
         "            place.mkdir(parents=True)\n",
         "            pass\n",
     ),
     Mend(
         "a refused command leaves its folder behind",
         _use("what_is_refused_leaves_no_place_behind"),
-        "star/cli/words.py",
+        "envs/common/files.py",
         "            place.rmdir()\n",
         "            pass\n",
     ),
