@@ -89,7 +89,9 @@ class TD3Config(BufferedConfig, LearnerConfig):
     tau: float = setting(
         0.005, "Target networks move by this share of the difference after each update.", unit="", gt=0, le=1
     )
-    min_transitions: Positive = setting(1000, "The first update waits for so many transitions.", unit="transitions")
+    min_transitions: Positive = setting(
+        1000, "The first update waits for so many transitions of random actions.", unit="transitions"
+    )
     updates_per_rollout: Repeats = setting(10, "Each rollout is followed by so many gradient updates.", unit="updates")
     policy_delay: Positive = setting(2, "The actor is updated once in so many updates of the critics.", unit="updates")
     target_noise: float = setting(
