@@ -8,7 +8,7 @@ from typing import Any
 
 from envs.common.errors import UserError
 from envs.common.files import given_back, new_place
-from star.config import kinds
+from star.config import agents, kinds
 from star.config.loading import experiment_of, kind_of, load_to_act, parse
 from star.config.loading import load as load_config
 from star.config.run import RunConfig
@@ -66,7 +66,7 @@ def evaluate(
     """Evaluate a checkpoint of a run, as `star evaluate RUN --json` does.
 
     Args:
-      run: the folder of the run.
+      run: the folder of the run, or the name of an agent that comes with the package.
       settings: by their dotted keys, as `{"trainer.eval_episodes": 200}`; those of `env.name` and `env.options` send
         the agents to another task.
       checkpoint: "last", "best", or its env steps.
@@ -80,8 +80,9 @@ def evaluate(
     """
     if checkpoint == "all":
         raise UserError("checkpoint: 'all' is not allowed: should be last, best or env steps")
-    measure = kind_of(Path(run)).commands.get("measure", _measure)
-    (row,) = measure(Path(run), settings or {}, checkpoint=str(checkpoint), seed=seed)
+    run_dir = agents.find(Path(run))
+    measure = kind_of(run_dir).commands.get("measure", _measure)
+    (row,) = measure(run_dir, settings or {}, checkpoint=str(checkpoint), seed=seed)
     return row
 
 
@@ -89,18 +90,19 @@ def load(run: str | Path, *, checkpoint: str | int = "last", seed: int | None = 
     """The trained agent of a run, to act with: of STAR's runs a `star.agent.acting.TrainedAgent`.
 
     Args:
-      run: the folder of the run.
+      run: the folder of the run, or the name of an agent that comes with the package.
       checkpoint: "last", "best", or its env steps.
       seed: which agent of the run; None: its first.
 
     Raises:
       UserError: in one line, if there is no such run or checkpoint, or its experiment has no agent that acts.
     """
-    commands = kind_of(Path(run)).commands
+    run_dir = agents.find(Path(run))
+    commands = kind_of(run_dir).commands
     if "load" not in commands:
-        name = experiment_of(Path(run))
+        name = experiment_of(run_dir)
         raise UserError(f"{run}: is a run of experiment {name}, which has no agent that acts")
-    return commands["load"](Path(run), checkpoint=str(checkpoint), seed=seed)
+    return commands["load"](run_dir, checkpoint=str(checkpoint), seed=seed)
 
 
 def _config(config: Any, settings: Mapping[str, Any], layers: Sequence[str | Path]) -> RunConfig:

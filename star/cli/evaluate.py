@@ -30,7 +30,13 @@ _OF_ITS_OWN: dict[str, Any] = {
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Its arguments."""
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run, or one RUN/checkpoints/STEPS of it")
+    parser.add_argument(
+        "runs",
+        nargs="*",
+        type=Path,
+        metavar="RUN",
+        help="run, one RUN/checkpoints/STEPS of it, or an agent of this package",
+    )
     parser.add_argument(
         "--checkpoint", default="last", metavar="last|best|all|STEPS", help="which ones of each RUN (default: last)"
     )

@@ -8,6 +8,7 @@ from typing import Any
 
 from star.cli import runs
 from star.cli.words import count, natural
+from star.config import agents
 from star.config.section import ConfigError
 
 HELP = "demonstrations by a trained agent"
@@ -18,7 +19,7 @@ does, as demonstrations for other agents: routes, states and actions."""
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Its arguments."""
-    parser.add_argument("run", type=Path, help="run directory")
+    parser.add_argument("run", type=Path, help="run directory, or an agent of this package")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=".npz")
     parser.add_argument("--episodes", type=count(10_000), default=100, metavar="N", help="to play (default: 100)")
     parser.add_argument("--checkpoint", default="last", metavar="last|best|STEPS", help="which one (default: last)")
@@ -30,6 +31,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     """Write demonstrations of the agent of a run."""
+    options.run = agents.find(options.run)
     kind = runs.kind_of([options.run], "record")
     if "record" not in kind.commands:
         raise ConfigError(f"{options.run}: its experiment makes no demonstrations")

@@ -9,7 +9,7 @@ from typing import Any
 from star.cli import runs
 from star.cli.evaluate import add_goals
 from star.cli.words import count, natural
-from star.config import kinds
+from star.config import agents, kinds
 from star.config.loading import DEFAULT
 from star.config.section import ConfigError
 
@@ -24,7 +24,13 @@ def add(parser: argparse.ArgumentParser) -> None:
     """Its arguments."""
     parser.add_argument("task", nargs="?", help="one of `star envs`, or MODULE:NAME; with --run its own task")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=".png, .jpg, .mp4, .gif or .html")
-    parser.add_argument("--run", type=Path, metavar="RUN", help="show the agent in this run directory")
+    parser.add_argument(
+        "--run",
+        "--agent",
+        type=Path,
+        metavar="RUN",
+        help="show the agent of this run, or of this package",
+    )
     parser.add_argument("--checkpoint", metavar="last|best|STEPS", help="which one of the run (default: last)")
     parser.add_argument("--seed", type=natural, metavar="N", help="which agent of the run (default: its first seed)")
     parser.add_argument(
@@ -47,6 +53,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     """Draw what the experiment of the run draws, or a task of STAR."""
+    options.run = options.run and agents.find(options.run)
     kind = kinds.find(DEFAULT) if options.run is None else runs.kind_of([options.run], "render")
     if "render" not in kind.commands:
         raise ConfigError(f"{options.run}: its experiment draws no episodes; see its figures in {options.run}/figures")

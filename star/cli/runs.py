@@ -7,7 +7,7 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
-from star.config import loading
+from star.config import agents, loading
 from star.config.kinds import Kind
 from star.config.loading import experiment_of
 from star.config.section import ConfigError
@@ -54,7 +54,7 @@ def _run_and_checkpoint(path: Path, wanted: str) -> tuple[Path, str]:
     """(RUN, STEPS) of a path RUN/checkpoints/STEPS, else the path as a run and what is wanted of it."""
     if path.parent.name == "checkpoints" and path.name.isdecimal():
         return path.parent.parent, path.name
-    return path, wanted
+    return agents.find(path), wanted
 
 
 def kind_of(runs: Sequence[Path], command: str) -> Kind:

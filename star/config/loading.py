@@ -17,7 +17,7 @@ from envs.common import reading
 from envs.common.errors import UserError, shown
 from envs.common.files import nearest_file
 from envs.common.plainly import plain
-from star.config import kinds, shipped
+from star.config import agents, kinds, shipped
 from star.config.described import EACH, settings
 from star.config.run import RunConfig
 from star.config.section import ConfigError, Section
@@ -84,7 +84,8 @@ def _config_file(run_dir: Path) -> Path:
     path = run_dir / "config.yaml"
     try:
         if not run_dir.exists():
-            raise ConfigError(f"{run_dir}: is not a run directory, there is nothing of this name")
+            meant = agents.near(run_dir)
+            raise ConfigError(f"{run_dir}: is not a run directory, there is nothing of this name{meant}")
         if run_dir.is_file():
             raise ConfigError(f"{run_dir}: is a file, not a run directory")
         if not path.is_file():

@@ -17,6 +17,7 @@ import star
 from envs.common.errors import UserError
 from star import cli
 from star.agent import play
+from star.agent.slim import slim
 from star.config.loading import load_to_act
 from star.training import checkpoint
 from star.training import program as programs
@@ -58,6 +59,31 @@ def test_it_acts_as_in_the_episodes_of_star_evaluate_bit_for_bit(run, agent, epi
         acted = np.stack([agent.act(one[shape]) for one in obs])
         np.testing.assert_array_equal(acted, np.clip(actions, -1, 1)[:, shape])
     assert len(acted) == STEPS and np.abs(np.diff(acted, axis=0)).max() > 0.1
+
+
+def test_a_slim_agent_acts_as_the_whole_one_and_holds_no_more_than_that_takes(run, agent):
+    obs = evaluated(run, EPISODES)[0][1]
+    whole = np.stack([agent.act(one) for one in obs])
+    state = agent._state
+    agent._state = slim(state)
+    try:
+        agent.reset()
+        np.testing.assert_array_equal(np.stack([agent.act(one) for one in obs]), whole)
+        for level in (agent._state.tutor, agent._state.controller):
+            assert not any(leaf.any() for leaf in jax.tree.leaves((level.optimizer, level.params["critic"])))
+        assert not agent._state.forward_model.ring.experience.start.any()
+    finally:
+        agent._state = state
+
+
+def test_an_agent_of_the_package_is_loaded_by_its_name_unless_there_is_a_folder_of_this_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert star.load("point_maze").config.env.name == "point_maze"
+    with pytest.raises(UserError, match=r"^point_mase: .* \(did you mean point_maze\?\)$"):
+        star.load("point_mase")
+    (tmp_path / "point_maze").mkdir()
+    with pytest.raises(UserError, match="^point_maze: is not a run directory"):
+        star.load("point_maze")
 
 
 def test_the_seed_of_an_episode_decides_what_follows_a_command_in_vain(agent):
