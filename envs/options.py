@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from envs.common.errors import UserError, shown
+from envs.common import plugins
+from envs.common.errors import UserError, shown, where_raised
 from envs.common.plainly import plain
 
 
@@ -71,6 +73,24 @@ def resolve(task: str, options: Mapping[str, Option], given: Mapping[str, Any]) 
         if not options[key].accepts(value):
             raise EnvError(f'option "{key}" of {task} is {shown(value)}; allowed: {options[key].allowed}')
     return {key: given.get(key, option.default) for key, option in options.items()}
+
+
+def made(name: str, factory: Callable[..., Any], given: Mapping[str, Any]) -> Any:
+    """What a user's own function, called `name` in errors, makes of these options.
+
+    Raises:
+      EnvError: in one line, if it does not take one of them, or raises something.
+    """
+    for option in given:
+        if not plugins.takes(factory, option):
+            taken = [p.name for p in inspect.signature(factory).parameters.values()]
+            raise EnvError(f'option "{option}" is not one of {name}; {known(option, taken)}')
+    try:
+        return factory(**given)
+    except UserError as error:
+        raise EnvError(f"{name}: {error}") from None
+    except Exception as error:  # whatever its author has done
+        raise EnvError(f"{name}: raises {where_raised(error)}") from error
 
 
 def known(word: str, words: Iterable[str]) -> str:

@@ -13,13 +13,12 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import Any, NoReturn
 
-from envs.common import modes
+from envs.common import modes, plugins
 from envs.common.errors import Notice, UserError
 from star import __version__
 from star.cli import completion, configs, envs, evaluate, ls, record, render, report, settings, sweep, train
 from star.cli.streams import unbroken
 from star.cli.words import split_settings, value
-from star.config import plugins
 from star.config.section import ConfigError
 from star.training.signals import at_once, end, leave
 

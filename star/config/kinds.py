@@ -15,8 +15,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from envs.common import plugins
 from envs.common.errors import UserError, shown
-from star.config import plugins
 from star.config.run import RunConfig
 from star.config.section import ConfigError
 

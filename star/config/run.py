@@ -8,9 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, create_model, field_validator
 
-from envs.common import reading
+from envs.common import plugins, reading
 from envs.common.errors import shown
-from star.config import plugins
 from star.config.section import Positive, Section, setting
 
 

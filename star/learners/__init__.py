@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxtyping import Array, Float
 
-from star.config import plugins
+from envs.common import plugins
 from star.learners.protocol import WHOLE, Learner, LearnerConfig, Rollout
 from star.learners.sections import LevelConfig
 

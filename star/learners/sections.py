@@ -7,8 +7,8 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
 
+from envs.common import plugins
 from envs.common.errors import shown
-from star.config import plugins
 from star.config.section import Batch, Hidden, Positive, Repeats, Section, setting
 from star.learners.protocol import Learner, LearnerConfig, Rollout
 

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from envs.common import plugins
 from envs.common.errors import UserError
 from star.cli import main
-from star.config import loading, plugins
+from star.config import loading
 from tests.small import EPOCH, RUN, arrays
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto.md"
