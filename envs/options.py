@@ -76,7 +76,7 @@ def resolve(task: str, options: Mapping[str, Option], given: Mapping[str, Any]) 
 
 
 def made(name: str, factory: Callable[..., Any], given: Mapping[str, Any]) -> Any:
-    """What a user's own function, called `name` in errors, makes of these options.
+    """Call a user's own function with these options; errors call it `name`.
 
     Raises:
       EnvError: in one line, if it does not take one of them, or raises something.

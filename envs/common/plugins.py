@@ -27,7 +27,7 @@ Kind = TypeVar("Kind")
 
 
 def is_plugin(name: object) -> bool:
-    """Whether `name` is text of the form `module:name`."""
+    """True if `name` is text of the form `module:name`."""
     return isinstance(name, str) and NAMED.fullmatch(name) is not None
 
 
@@ -89,7 +89,7 @@ def find_function(name: str, *, makes: str) -> Callable[..., Any]:
 
 
 def takes(function: Callable[..., Any], option: str) -> bool:
-    """Whether it may be called with this keyword."""
+    """True if the function may be called with this keyword."""
     parameters = inspect.signature(function).parameters.values()
     return any(p.kind == p.VAR_KEYWORD or (p.name == option and p.kind != p.POSITIONAL_ONLY) for p in parameters)
 
