@@ -29,14 +29,16 @@ def posture(
 
     The last two links are taken as one that is bent at the wrist: the farther the target, the less. Its length goes
     from that of the first link, where the target is the base, to that of both, where it is at full reach, so all points
-    within reach have a posture. `elbow` and `wrist`, 1 or -1, are the sides to which the arm bends.
+    within reach have a posture. `elbow` and `wrist` are 1 or -1. With 1 a joint bends to the side of the target, left
+    or right of x, so that the angle of the shoulder never jumps by a full turn.
     """
     first, second, third = links
+    side = jnp.where(target[..., 1] < 0, -1.0, 1.0)
     distance = jnp.minimum(jnp.linalg.norm(target, axis=-1), first + second + third)
     outer = first + (second + third - first) * distance / (first + second + third)
-    bend = wrist * _opposite(second, third, outer)
+    bend = side * wrist * _opposite(second, third, outer)
     lean = jnp.arctan2(third * jnp.sin(bend), second + third * jnp.cos(bend))
-    turn = elbow * _opposite(first, outer, distance)
+    turn = side * elbow * _opposite(first, outer, distance)
     shoulder = jnp.arctan2(target[..., 1], target[..., 0]) - jnp.arctan2(
         outer * jnp.sin(turn), first + outer * jnp.cos(turn)
     )

@@ -13,7 +13,6 @@ Setup after Duminy, Nguyen and Duhaut (arXiv 1810.04877, doi 10.3389/fnbot.2018.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from enum import IntEnum
 from functools import partial
 from typing import Any, NamedTuple
@@ -170,27 +169,23 @@ def _last_line(contact: Bool[Array, "steps"], ground: Float[Array, "2 steps"]) -
     return jnp.concatenate([ground[:, first], ground[:, last]]), contact.any()
 
 
-def _demonstrations(task: int) -> Callable[[Array], Array]:
-    """The teacher of a task: of the ways in which the arm may go there, the first that is near enough.
+def _show_pen(goal: Float[Array, "4"]) -> Float[Array, "2 14"]:
+    """The teacher of the pen: of the ways in which the arm may bring it there, the first that is near enough.
 
-    He tries both sides for elbow and wrist and, with the pen in the hand, several heights on the way: some lead past a
-    joystick, and touching it breaks both.
+    Some ways lead past a joystick, and touching that breaks both.
     """
-    lifts = LIFTS if task in (Tasks.PEN, Tasks.LINE) else LIFTS[:1]
-    tried = jnp.array(list(itertools.product((1.0, -1.0), (1.0, -1.0), lifts)))
-
-    def show(goal: Float[Array, "4"]) -> Float[Array, "n 14"]:
-        ways = jax.vmap(lambda way: _way(task, goal, *way))(tried)
-        whole = jnp.pad(ways, ((0, 0), (0, LONGEST - ways.shape[1]), (0, 0)))
-        found, _ = jax.vmap(simulate, in_axes=(0, None))(whole, jnp.int32(ways.shape[1]))
-        error = jnp.where(found.reached[:, task], jnp.abs(found.value[:, task] - goal).max(axis=1), jnp.inf)
-        return ways[jnp.argmin(jnp.where(error < NEAR, 0.0, error))]
-
-    return show
+    tried = jnp.array(list(itertools.product((1.0, -1.0), (1.0, -1.0), LIFTS)))
+    ways = jax.vmap(lambda way: _way(Tasks.PEN, goal, *way))(tried)
+    whole = jnp.pad(ways, ((0, 0), (0, LONGEST - ways.shape[1]), (0, 0)))
+    found, _ = jax.vmap(simulate, in_axes=(0, None))(whole, jnp.int32(ways.shape[1]))
+    error = jnp.where(found.reached[:, Tasks.PEN], jnp.abs(found.value[:, Tasks.PEN] - goal).max(axis=1), jnp.inf)
+    return ways[jnp.argmin(jnp.where(error < NEAR, 0.0, error))]
 
 
-def _way(task: int, goal: Float[Array, "4"], elbow: Array, wrist: Array, lift: Array) -> Float[Array, "n 14"]:
-    """The primitives that reach the goal, their joints bent to these sides; `lift` is the height on the way to it."""
+def _way(
+    task: int, goal: Float[Array, "4"], elbow: Any = 1.0, wrist: Any = 1.0, lift: Any = LIFTS[0]
+) -> Float[Array, "n 14"]:
+    """The primitives that reach a goal; `lift` is the height on the way with the pen, the sides are those of `arms`."""
     pen = jnp.array(OBJECTS[0])
     if task == Tasks.TIP:
         stops = [goal[:3]]
@@ -204,29 +199,25 @@ def _way(task: int, goal: Float[Array, "4"], elbow: Array, wrist: Array, lift: A
         stops = [*_push(task - Tasks.JOYSTICK_1, goal[:3])]
     vias = [stop[2] for stop in stops]
     if task in (Tasks.PEN, Tasks.LINE):
-        vias[1] = lift
+        vias[1] = jnp.asarray(lift)
     return jnp.stack([_reach(stop, via, elbow, wrist) for stop, via in zip(stops, vias, strict=True)])
 
 
-def _decompositions(task: int) -> Callable[[Array], tuple[Subgoal, Subgoal]] | None:
-    """The teacher of procedures of a task, who knows two goals that make up one; None for the tip."""
-    if task == Tasks.TIP:
-        return None
+def _parts(task: int, goal: Float[Array, "4"]) -> tuple[Subgoal, Subgoal]:
+    """The teacher of procedures: two goals that make up one of any task but the tip."""
     if task == Tasks.PEN:
-        return lambda goal: ((Tasks.TIP, OBJECTS[0]), (Tasks.TIP, goal[:3]))
+        return (Tasks.TIP, OBJECTS[0]), (Tasks.TIP, goal[:3])
     if task == Tasks.LINE:
-        return lambda goal: ((Tasks.PEN, _ends(goal)[0]), (Tasks.TIP, _ends(goal)[1]))
+        first, last = _ends(goal)
+        return (Tasks.PEN, first), (Tasks.TIP, last)
     if task == Tasks.CHARACTER:
-        return lambda goal: ((Tasks.JOYSTICK_1, _axes(goal)[0]), (Tasks.JOYSTICK_2, _axes(goal)[1]))
-
-    def push(goal: Array) -> tuple[Subgoal, Subgoal]:
-        middle, there = _push(task - Tasks.JOYSTICK_1, goal[:3])
-        return (Tasks.TIP, middle), (Tasks.TIP, there)
-
-    return push
+        first, last = _axes(goal)
+        return (Tasks.JOYSTICK_1, first), (Tasks.JOYSTICK_2, last)
+    first, last = _push(task - Tasks.JOYSTICK_1, goal[:3])
+    return (Tasks.TIP, first), (Tasks.TIP, last)
 
 
-def _reach(place: Array, via: Array, elbow: Array, wrist: Array) -> Float[Array, "14"]:
+def _reach(place: Array, via: Array, elbow: Any, wrist: Any) -> Float[Array, "14"]:
     """A primitive that ends with the tip at `place` [3] and passes the height `via` half way through: w = 0."""
     angles = arms.posture(place[:2], LINKS, elbow=elbow, wrist=wrist)
     command = jnp.zeros((JOINTS, NUMBERS)).at[:, -1].set(angles / jnp.pi)
@@ -318,7 +309,13 @@ def _sketch_objects(axes: Any, path: Path, step: int) -> None:
 def make() -> World:
     """The world `pen`: six tasks, sequences of up to four primitives of 14 numbers."""
     tasks = tuple(
-        Task(task.name.lower(), lower, upper, partial(_goals, task), _demonstrations(task), _decompositions(task))
-        for task, (lower, upper) in zip(Tasks, BOUNDS, strict=True)
+        Task(
+            task.name.lower(),
+            *bounds,
+            goals=partial(_goals, task),
+            demonstrate=_show_pen if task == Tasks.PEN else partial(_way, task),
+            decompose=None if task == Tasks.TIP else partial(_parts, task),
+        )
+        for task, bounds in zip(Tasks, BOUNDS, strict=True)
     )
     return World("pen", PRIMITIVE, LONGEST, tasks, simulate, sketch)

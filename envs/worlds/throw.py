@@ -170,7 +170,7 @@ def _show_place(goal: Float[Array, "4"]) -> Float[Array, "1 9"]:
 
 def _on_table(goal: Array) -> Float[Array, "3"]:
     """The angles at which the arm is at `goal` on the table, or as near as can be."""
-    return arms.posture(_place_of(goal) - jnp.array([0.0, SHOULDER]), LINKS, elbow=-1, wrist=-1)
+    return arms.posture(_place_of(goal) - jnp.array([0.0, SHOULDER]), LINKS)
 
 
 def _place_of(goal: Array) -> Float[Array, "2"]:
@@ -194,7 +194,7 @@ def _cells_on_table() -> Float[np.ndarray, "n 2"]:
         return near & (jnp.abs(angles) <= jnp.array(LIMITS)).all() & (jnp.abs(place[0]) > INNER)
 
     cells = _cells()
-    return cells[np.asarray(jax.vmap(able)(jnp.asarray(cells, jnp.float32)))]
+    return cells[np.asarray(jax.jit(jax.vmap(able))(jnp.asarray(cells, jnp.float32)))]
 
 
 def sketch(figure: Any, path: Path, step: int, task: int | None, goal: Any) -> None:
