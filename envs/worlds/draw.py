@@ -41,7 +41,7 @@ def still(
         world.sketch(figure, path, step, index, marked)
     if index is not None and marked is not None:
         apart = np.linalg.norm(found.value[index] - marked)
-        said = f"{apart:.3f} from the goal" if found.reached[index] else "not reached"
+        said = f"ends {apart:.3f} from the goal" if found.reached[index] else "not reached"
         figure.suptitle(f"{world.names[index]}: {said}", x=0.01, ha="left", size=10, color=INK)
     return _pixels(figure)
 
