@@ -16,6 +16,7 @@ from typing import Any
 from envs.common import modes, plugins
 from envs.common.errors import shown
 from envs.options import EnvError, known, made, number, resolve
+from envs.worlds.checks import check
 from envs.worlds.world import Decomposition, Outcomes, Task, Trace, World, outcomes
 
 __all__ = ["Decomposition", "Outcomes", "Task", "Trace", "World", "make", "names", "outcomes"]
@@ -46,8 +47,10 @@ def make(name: str, *, noise: float = 0.0, **options: Any) -> World:
     if plugins.is_plugin(name):
         resolve(name, _NOISE, {"noise": noise})
         world = made(name, plugins.find_function(name, makes="a world"), options)
-        if not isinstance(world, World):
-            raise EnvError(f"{name}: makes {shown(world)}; allowed: an envs.worlds.World")
+        try:
+            check(world)
+        except EnvError as error:
+            raise EnvError(f"{name}: {error}") from error
     elif name in _HOMES:
         resolve(name, _NOISE, options | {"noise": noise})
         world = importlib.import_module(_HOMES[name]).make()

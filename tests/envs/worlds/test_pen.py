@@ -13,9 +13,9 @@ from tests.envs.worlds import slow
 
 WORLD = worlds.make("pen")
 BATCH = 300  # one shape for nearly all: compilation is what costs
-SHARES = {  # of 400,000 random sequences of one primitive and of four, by task
-    1: (1, 0.0187, 0.0128, 0.0014, 0.0012, 0.0026),
-    4: (1, 0.0670, 0.0576, 0.0051, 0.0048, 0.0098),
+SHARES = {  # of 700,000 random sequences of one primitive and a million of four, by task
+    1: (1, 0.0189, 0.0130, 0.00136, 0.00127, 0.00263),
+    4: (1, 0.0674, 0.0577, 0.0050, 0.0049, 0.0098),
 }
 PEN, STICK_1, STICK_2 = pen.OBJECTS
 
@@ -94,7 +94,7 @@ def test_the_teacher_reaches_every_goal_of_the_evaluation(task, shown):
 
 @pytest.mark.parametrize("length", SHARES)
 def test_random_sequences_reach_each_task_as_often_as_the_page_says(length):
-    n = 20_000
+    n = 12_000
     counts = np.asarray(WORLD.execute(random_sequences(n, seed=7), length).reached).sum(axis=0)
     for count, share in zip(counts, SHARES[length], strict=True):
         assert abs(count - n * share) <= 4 * np.sqrt(n * share * (1 - share)) + 1
@@ -172,7 +172,7 @@ def test_the_tip_alone_has_no_decomposition():
     assert not parts.exists.any() and parts.tasks.shape == (5, 2) and parts.goals.shape == (5, 2, 4)
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.integers(0, 2**31 - 1))
 def test_outcomes_lie_within_their_bounds_and_a_longer_sequence_begins_like_a_shorter(seed):
     sequences = np.tile(random_sequences(75, seed), (4, 1, 1))
@@ -186,7 +186,7 @@ def test_outcomes_lie_within_their_bounds_and_a_longer_sequence_begins_like_a_sh
         np.testing.assert_array_equal(np.ptp(tips[length - 1, :, 30 * length - 1 :], axis=1), 0)  # then it stays
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.integers(0, 2**31 - 1), st.permutations(range(60)))
 def test_the_order_of_a_batch_does_not_matter(seed, order):
     sequences, lengths = random_sequences(60, seed), np.random.default_rng(seed).integers(1, 5, 60)

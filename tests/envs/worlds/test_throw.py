@@ -15,14 +15,14 @@ def random_movements(n, seed=0):
 
 
 def test_it_agrees_with_a_slow_simulation_of_the_fall():
-    shown = [np.asarray(WORLD.demonstrate(task, WORLD.benchmark(task))[0])[::4] for task in range(2)]
+    shown = [np.asarray(WORLD.demonstrate(task, WORLD.benchmark(task))[0])[::8] for task in range(2)]
     slight = [np.clip(one + np.random.default_rng(0).normal(0, 0.02, one.shape), -1, 1) for one in shown]
     sequences = np.concatenate([*shown, *slight, random_movements(200)]).astype(np.float32)
     found = WORLD.execute(sequences, 1)
     expected = [slow.throw(sequence[0]) for sequence in sequences]
     np.testing.assert_array_equal(found.reached, [reached for _, reached in expected])
     np.testing.assert_allclose(found.value, [value for value, _ in expected], atol=1e-4)
-    assert (np.asarray(found.reached).sum(axis=0) > 50).all()
+    assert (np.asarray(found.reached).sum(axis=0) > 30).all()
 
 
 @pytest.mark.parametrize("task", range(2))

@@ -14,6 +14,7 @@ from envs.common import plugins
 from envs.common.errors import UserError
 from envs.options import EnvError
 from star import debugging
+from tests.scripts import load
 
 PAGE = (Path(__file__).parents[3] / "docs" / "worlds.md").read_text(encoding="utf-8")
 
@@ -53,6 +54,24 @@ def nothing():
     return 3
 
 
+def changed(**changes):
+    return lambda: dataclasses.replace(ADDING, **changes)
+
+
+def task(*bounds, name="sum"):
+    return worlds.Task(name, *bounds, goals=lambda: np.zeros((1, 2)))
+
+
+no_length = changed(longest=0)
+no_tasks = changed(tasks=())
+twins = changed(tasks=(task((0.0,), (1.0,)), task((0.0,), (1.0,))))
+too_wide = changed(tasks=(task((0.0,) * 5, (1.0,) * 5),))
+upside_down = changed(tasks=(task((1.0,), (0.0,)),))
+other_tasks = changed(tasks=ADDING.tasks[:1])
+no_path = changed(simulate=lambda sequence, length: (add(sequence, length)[0], ()))
+raising = changed(simulate=lambda sequence, length: sequence @ jnp.zeros(9))
+
+
 @pytest.fixture(autouse=True)
 def here(monkeypatch):
     monkeypatch.setitem(sys.modules, "adding", sys.modules[__name__])
@@ -77,6 +96,14 @@ def test_a_world_is_found_by_its_name_or_that_of_its_function():
         ("adding:broken", {}, "adding:broken: raises RuntimeError: no such luck"),
         ("adding:PAGE", {}, "adding:PAGE: is a str; allowed: a function that makes a world"),
         ("adding:maek", {}, "adding:maek: adding holds no maek (did you mean make?)"),
+        ("adding:no_length", {}, "adding:no_length: longest is 0; allowed: a whole number from 1"),
+        ("adding:no_tasks", {}, "its tasks are called (); allowed: one task or more"),
+        ("adding:twins", {}, "its tasks are called ('sum', 'sum'); allowed: one task or more, each with its own name"),
+        ("adding:too_wide", {}, "bounds of sum have the shapes ((5,), (5,)); allowed: 1 to 4 numbers each"),
+        ("adding:upside_down", {}, "bounds of sum are (1.0,) and (0.0,); allowed: lower below upper"),
+        ("adding:other_tasks", {}, "simulate gives no outcomes of 1 tasks; allowed: (envs.worlds.outcomes(...), path)"),
+        ("adding:no_path", {}, "a path has leading axes []; allowed: one, the same number of control steps for each"),
+        ("adding:raising", {}, "adding:raising: simulate raises TypeError: dot_general requires"),
         ("logging:basicConfig", {}, "only a file names it, so it is not imported; type --import logging"),
     ],
 )
@@ -183,6 +210,11 @@ def test_arrays_have_the_shapes_that_they_are_said_to_have():
             del sys.modules[name]
         sys.modules.update(before)
         sys.modules["envs"].worlds = before["envs.worlds"]
+
+
+def test_the_benchmark_counts_executions():
+    row = load("benchmarks/worlds").measure("throw", 4, repeats=2)
+    assert row["executions_per_s"] > 0 and row["cpu_us"] > 0
 
 
 def test_the_world_of_the_page_works_as_it_says(tmp_path, monkeypatch):
