@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from enum import IntEnum
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -306,6 +306,7 @@ def _sketch_objects(axes: Any, path: Path, step: int) -> None:
         axes.plot(*at, "d", color=draw.INK, ms=8, zorder=7)
 
 
+@cache  # programs are compiled once for a world, and again for one that is merely alike
 def make() -> World:
     """The world `pen`: six tasks, sequences of up to four primitives of 14 numbers."""
     tasks = tuple(

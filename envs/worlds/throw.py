@@ -10,6 +10,7 @@ after the setup of SGIM-ACTS (Nguyen and Oudeyer 2012, arXiv 1804.06819).
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -62,6 +63,7 @@ class Movement(NamedTuple):
     share: Float[Array, ""]
 
 
+@cache  # programs are compiled once for a world, and again for one that is merely alike
 def make() -> World:
     """The world `throw`: two tasks, sequences of one primitive of 9 numbers."""
     bounds = (-1.0, -1.0), (1.0, 1.0)

@@ -116,14 +116,15 @@ class World:
         """
         if isinstance(task, str) and task in self.names:
             return self.names.index(task)
-        if isinstance(task, int) and 0 <= task < len(self.tasks):
-            return task
+        if isinstance(task, int | np.integer) and 0 <= task < len(self.tasks):
+            return int(task)
         raise EnvError(f'task "{task}" is not one of {self.name}; {known(str(task), self.names)}')
 
     def execute(self, sequence: Array, length: Array | int, *, key: Key[Array, ""] | None = None) -> Outcomes:
         """The outcomes of `sequence` [*batch, L, p], whose first `length` [*batch] primitives are executed.
 
-        Numbers are clipped to [-1, 1]. `key`, one for the whole batch, is needed only if there is noise.
+        Numbers are clipped to [-1, 1], lengths to 1 to L. `key`, one for the whole batch, is needed only if
+        there is noise.
 
         Raises:
           EnvError: in one line, if a shape is wrong or the key is missing.

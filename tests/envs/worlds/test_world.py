@@ -188,6 +188,7 @@ def test_nothing_is_compiled_twice():
         world.execute(np.zeros((4, 3, 2), np.float64), np.full(4, length))
         world.trace(np.zeros((4, 3, 2)), length)
     assert len(traced) == 2  # of `execute` and of `trace`
+    assert all(worlds.make(name, noise=0.1) == worlds.make(name, noise=0.1) for name in worlds.names())
 
 
 def test_arrays_have_the_shapes_that_they_are_said_to_have():
