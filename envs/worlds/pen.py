@@ -268,7 +268,8 @@ def sketch(figure: Any, path: Path, step: int, task: int | None, goal: Any) -> N
     """The arm from above, the height of its tip, and the game, after a control step."""
     above, height, game = figure.subplots(1, 3, width_ratios=[1.2, 0.8, 0.8])
     until, second = slice(0, step % len(path.tip) + 1), np.arange(1, len(path.tip) + 1) / STEPS
-    draw.panel(above, f"from above, {second[step]:.1f} s", x=(-1.05, 1.05), y=(-1.05, 1.05))
+    broken = ", broken" if path.hand[step] == Hand.BROKEN else ""
+    draw.panel(above, f"from above, {second[step]:.1f} s{broken}", x=(-1.05, 1.05), y=(-1.05, 1.05))
     _sketch_objects(above, path, step)
     above.plot(*path.tip[until, :2].T, color=draw.TRAIL, lw=0.8, alpha=0.6)
     drawn = np.where(path.contact[until, None], path.tip[until, :2], np.nan)
