@@ -35,7 +35,7 @@ from star.abstraction import regions
 from star.agent import environment
 from star.cli.streams import unbroken
 from star.cli.words import split_settings
-from star.config import plugins
+from star.config import command_line
 from star.config.loading import parse
 from star.sgim import teachers
 from star.spec import Spec
@@ -194,7 +194,7 @@ def test_goal_selection_alone_refuses_the_modes_that_environments_refuse(mode):
 
 def test_printed_commands_can_be_typed(tmp_path, monkeypatch):
     monkeypatch.delenv("STAR_IMPORT", raising=False)
-    assert plugins.command("evaluate", Path("runs/a b")) == "star evaluate 'runs/a b'"
+    assert command_line.of("evaluate", Path("runs/a b")) == "star evaluate 'runs/a b'"
     (tmp_path / "a b").mkdir()
     (tmp_path / "a b" / "x").touch()
     command = ["train", str(ROOT / "configs/point_maze.yaml"), "--run-dir", str(tmp_path / "a b")]

@@ -199,7 +199,7 @@ MENDS = (
     Mend(
         "printed commands are not quoted",
         _use("printed_commands_can_be_typed"),
-        "star/config/plugins.py",
+        "star/config/command_line.py",
         'return shlex.join(["star", *map(str, words), *imports])',
         'return " ".join(["star", *map(str, words), *imports])',
     ),

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from star.agent.episodes import MEASURES
-from star.config import plugins
+from star.config import command_line
 from star.report.statistics import ABOVE
 
 _PLAIN_WIDTH = 200  # columns where nobody looks at a terminal
@@ -34,7 +34,7 @@ def show(rows: Sequence[Row], comparison: Mapping[str, Any] | None, *, again: Se
         row, seed = failing
         words = ["--run", row["run"], "--checkpoint", row["env_steps"]]
         words += ["--seed", seed["seed"], "--episode", seed["failed"][0]]
-        print("watch a failure:", plugins.command("render", *words, *again, "--out", "failure.html"))
+        print("watch a failure:", command_line.of("render", *words, *again, "--out", "failure.html"))
     if comparison:
         console.print(groups(comparison["groups"]))
         if comparison["improvement"]:

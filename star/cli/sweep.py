@@ -10,7 +10,7 @@ from rich.console import Console
 
 from envs.common.files import given_back, new_place
 from star.cli.words import count
-from star.config import plugins
+from star.config import command_line
 
 HELP = "try many settings"
 DESCRIPTION = """\
@@ -49,7 +49,7 @@ def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         summary = work.run(found, out, storage=options.storage, quiet=options.quiet)
     Console().print(results.table(summary.rows, found))
     if not summary.finished:
-        again = plugins.command("sweep", options.file, *(["--storage", "URL"] if options.storage else []), "--out", out)
+        again = command_line.of("sweep", options.file, *(["--storage", "URL"] if options.storage else []), "--out", out)
         print(f"interrupted; running trials were given back; go on with: {again}")
         return 130
     print(f"trials:  {out}/trials.csv")
@@ -57,5 +57,5 @@ def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         print("no trial was completed")
         return 1
     print(f"figures: {out}/figures/\nbest:    trial {summary.best['trial']}")
-    print(f"next:    {plugins.command('train', out / 'best.yaml')}")
+    print(f"next:    {command_line.of('train', out / 'best.yaml')}")
     return 0

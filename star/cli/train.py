@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from envs.common.files import given_back, new_place
 from star.cli.words import count
-from star.config import kinds, plugins
+from star.config import command_line, kinds
 from star.config.loading import load, load_run, parse
 from star.config.run import RunConfig
 from star.config.section import ConfigError
@@ -113,7 +113,7 @@ def _say_how_it_ended(result: Result, config: RunConfig) -> None:
         print(f"stopped: {result.fault}; {_after_a_fault(result, config)}", file=sys.stderr)
         return
     if result.interrupted:
-        again = plugins.command("train", "--resume", run_dir)
+        again = command_line.of("train", "--resume", run_dir)
         print(f"interrupted at {result.env_steps:,} {kind.unit}; go on with: {again}")
         return
     if result.env_steps == result.began:
@@ -123,7 +123,7 @@ def _say_how_it_ended(result: Result, config: RunConfig) -> None:
     score = "" if result.score is None else f", {measure.name} {result.score:.2f} {measure.where}".rstrip()
     print(f"trained {result.env_steps:,} {kind.unit}{score}")
     print(f"figure:  {run_dir}/figures/summary.png\nmetrics: {run_dir}/metrics.jsonl")
-    print(f"next:    {plugins.command('evaluate', run_dir)}")
+    print(f"next:    {command_line.of('evaluate', run_dir)}")
 
 
 def _after_a_fault(result: Result, config: RunConfig) -> str:
@@ -135,5 +135,5 @@ def _after_a_fault(result: Result, config: RunConfig) -> str:
         return f"there is no checkpoint from before; begin anew with {' '.join(flags)}"
     return (
         f"the checkpoint of {result.saved:,} {kinds.of(config).unit} is sound; "
-        f"go on with: {plugins.command('train', '--resume', result.run_dir, *flags)}"
+        f"go on with: {command_line.of('train', '--resume', result.run_dir, *flags)}"
     )

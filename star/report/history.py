@@ -15,7 +15,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from star.config import kinds, plugins
+from star.config import command_line, kinds
 from star.config.loading import changed, dotted, load, parse
 from star.config.run import RunConfig
 from star.config.section import ConfigError
@@ -154,7 +154,7 @@ def _again(run_dir: Path, stretches: Sequence[Stretch]) -> str:
     noted = [dotted(load(run_dir / "config.yaml"))] + [tables[0]] * (len(tables) - 1)
     for command, before, table in zip(commands, noted, tables, strict=True):
         command += [word for key, value in changed(before, table).items() for word in (f"--{key}", _worded(value))]
-    return " && ".join(plugins.command(*words) for words in commands)
+    return " && ".join(command_line.of(*words) for words in commands)
 
 
 def _checked(lines: JsonLines, kinds: Kinds) -> list[Row]:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from envs.common import files
-from star.config import kinds, plugins
+from star.config import command_line, kinds
 from star.config.kinds import Measure
 from star.config.run import RunConfig
 from star.report import history, statistics
@@ -195,7 +195,7 @@ def short(values: Any, *, digits: int = 4) -> list[float | None]:
 def film(run_dir: Path) -> dict[str, Any]:
     """The newest film in the figures of a run that is small enough, as text or base64, and how to make one."""
     out = str(run_dir / "figures" / "episode.html")
-    command = plugins.command("render", "--run", run_dir, "--out", out, *_SMALL_FILM)
+    command = command_line.of("render", "--run", run_dir, "--out", out, *_SMALL_FILM)
     folder = run_dir / "figures"
     found = [path for path in folder.iterdir() if path.suffix in _FILMS] if folder.is_dir() else []
     newest = sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)

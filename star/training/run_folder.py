@@ -10,7 +10,7 @@ from typing import Any
 
 from envs.common import files
 from star import devices
-from star.config import plugins
+from star.config import command_line
 from star.config.loading import changed, dotted, load_run
 from star.config.run import RunConfig
 from star.config.section import ConfigError
@@ -27,7 +27,7 @@ def make(run_dir: Path) -> None:
     try:
         used = run_dir.is_dir() and any(not entry.name.startswith(_BEGUN) for entry in run_dir.iterdir())
         if used or (run_dir.exists() and not run_dir.is_dir()):
-            again = plugins.command("train", "--resume", run_dir)
+            again = command_line.of("train", "--resume", run_dir)
             raise ConfigError(f"{run_dir}: is not empty; choose another --run-dir, or go on with it: {again}")
         devices.wait("the run directory is empty")
         run_dir.mkdir(parents=True, exist_ok=True)
