@@ -188,7 +188,7 @@ def _worth_by_now(
     led_out = past[..., 2:] == 1
     left, stayed = (commanded * led_out).sum(axis=1), (commanded * ~led_out).sum(axis=1)
     luck = jnp.maximum(_rule(section).staying(section, state, region, goal_region) ** stayed, 1e-30)
-    return section.retry**left * luck / (section.trust * luck + 1 - section.trust)
+    return section.retry**left * luck / (section.trust * luck + (1 - section.trust))
 
 
 def experience(
