@@ -25,6 +25,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
+from PIL import Image  # noqa: E402
 
 import envs  # noqa: E402
 from envs import arena, opengl  # noqa: E402
@@ -36,6 +37,7 @@ from star.agent.decisions import Roadmap  # noqa: E402
 from star.agent.sections import StarTrainerConfig  # noqa: E402
 from star.config import loading  # noqa: E402
 from star.spec import Spec  # noqa: E402
+from star.training import loop  # noqa: E402
 from star.training import program as programs  # noqa: E402
 from star.training.checkpoint import Checkpoints  # noqa: E402
 from tests.browser import program, started
@@ -139,7 +141,8 @@ def compiled_once():
         if key is None:
             return build(config)
         if key not in known:
-            known[key] = build(config)
+            program = build(config)
+            known[key] = known.setdefault(compiled(program.config), program)  # with which a run goes on
         program = known[key]
         resolved = program.experiment.resolve(config)
         return replace(program, config=resolved, hyper=resolved.hyper())
@@ -168,6 +171,19 @@ def compiled(config):
 def with_map(options):
     """These options with the rows of their map instead of its file, which may change."""
     return options | {"map": arena.load(options["map"])} if "map" in options else options
+
+
+@pytest.fixture
+def undrawn():
+    """Runs of the test make their figures and draw none: that takes longer than all else. Those of fixtures do draw."""
+
+    def save(figure, path):
+        path.parent.mkdir(exist_ok=True)
+        Image.new("RGB", (1, 1)).save(path)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "save", save)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -225,6 +241,17 @@ def breaking_env():
         flip="terminate",
     )
     return envs.VectorEnv(env, NUM_ENVS, auto_reset=False)
+
+
+@pytest.fixture(scope="session")
+def fresh(tiny, breaking_env):
+    """The tiny hierarchy as it begins, from a seed, with other sections of its settings if these are given."""
+    init, spec = jax.jit(levels.init, static_argnames="spec"), Spec.of(breaking_env.env)
+
+    def begun(seed=0, **sections):
+        return init(loading.parse({**tiny, **sections}).hyper(), spec, key=jax.random.key(seed))
+
+    return begun
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,12 @@
-"""A run on a maze small enough to train in a second."""
+"""A run on a maze small enough to train in a second, and teachers who show it a few ways."""
 
 import shutil
 from pathlib import Path
 
+import jax.numpy as jnp
+import numpy as np
+
+from star.sgim.teachers import Demonstrations
 from star.training.checkpoint import opened
 
 EPOCH = 4 * 60  # env steps
@@ -18,6 +22,12 @@ RUN = {
     "trainer": {"num_envs": 4, "total_env_steps": 4 * EPOCH, "eval_every": 2, "eval_episodes": 3},
 }
 
+# The Controller alone: where any agent will do, it compiles in a fifth of the time.
+ALONE = RUN | {"commander": {"enabled": False}, "tutor": {"enabled": False, "unroll": 1}}
+
+GUIDE = {"name": "guide", "kind": "decomposition"}
+ACTS = {"name": "acts", "kind": "action", "source": "demos.npz"}
+
 
 def arrays(run, env_steps):
     """Those of a checkpoint, by their names."""
@@ -29,3 +39,18 @@ def unpacked(name, folder):
     """The run in `tests/data/<name>.zip`, in a new folder below `folder`."""
     shutil.unpack_archive(Path(__file__).parent / "data" / f"{name}.zip", folder / name)
     return folder / name
+
+
+def demonstrations(seed=0, n=5, length=3):
+    """What a teacher shows: `n` random episodes with `length` waypoints each."""
+    rng = np.random.default_rng(seed)
+    points = lambda *shape: jnp.asarray(rng.uniform(0, 4, (*shape, 2)), jnp.float32)  # noqa: E731
+    lengths = jnp.asarray(rng.integers(1, 7, n))
+    return Demonstrations(
+        starts=points(n),
+        outcomes=points(n),
+        waypoints=points(n, length),
+        states=jnp.asarray(rng.normal(size=(n, 8, 4)), jnp.float32),
+        actions=jnp.asarray(rng.normal(size=(n, 8, 2)), jnp.float32),
+        lengths=lengths,
+    )

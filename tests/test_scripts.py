@@ -20,7 +20,6 @@ from envs.arena import Arena
 from star.abstraction import reachability
 from star.abstraction.forward_model import Outcome
 from star.abstraction.reachability import MISSES, REACHES
-from star.agent import levels
 from star.agent.decisions import Decision
 from star.config import loading
 from star.learners import replay
@@ -196,11 +195,15 @@ def test_curves_are_drawn(tmp_path):
     assert (tmp_path / "asked.png").stat().st_size > (tmp_path / "curves.png").stat().st_size
 
 
-def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env):
+@pytest.fixture
+def four_regions(tiny):
+    return {**tiny["abstraction"], "cuts": [[8.0], [8.0]]}
+
+
+def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env, fresh, four_regions):
     script = load("checks/abstraction")
     spec = Spec.of(breaking_env.env)
-    agent = loading.parse(tiny, {"abstraction.cuts": [[8.0], [8.0]]}).hyper()
-    state = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
+    agent, state = loading.parse({**tiny, "abstraction": four_regions}).hyper(), fresh(abstraction=four_regions)
     verdict = state.graph.verdict.at[0, 1].set(REACHES).at[1, 0].set(MISSES)
     state = state.replace(graph=state.graph.replace(verdict=verdict))
     # (region, target, next region): 0 -> 1 is right in 3 of 4 rollouts, 1 -> 0 in 1 of 2, and one does not count.
@@ -248,13 +251,12 @@ def test_no_random_triple_of_the_check_of_soundness_lies_outside_of_its_hull(see
     assert row["triples"] >= 10_000 and row["outside"] == 0 and row["nearest_ulp"] > 0
 
 
-def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_small(tiny, breaking_env, monkeypatch):
+def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_small(
+    tiny, fresh, four_regions, monkeypatch
+):
     """The forward model moves everything one region to the right, and by some noise."""
-    script, spec = load("checks/soundness"), Spec.of(breaking_env.env)
-    agent = loading.parse(
-        tiny, {"abstraction.cuts": [[8.0], [8.0]], "refinement.parts": 8, "refinement.depth": 3}
-    ).hyper()
-    state = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
+    script, state = load("checks/soundness"), fresh(abstraction=four_regions)
+    agent = loading.parse({**tiny, "abstraction": four_regions}, {"refinement.parts": 8, "refinement.depth": 3}).hyper()
     layer = state.forward_model.params["params"]["Dense_1"]
     moving = {"kernel": 0.1 * layer["kernel"], "bias": jax.numpy.array([1.0, 0.0])}
     params = {"params": {**state.forward_model.params["params"], "Dense_1": moving}}

@@ -18,12 +18,11 @@ from star.agent.growth_map import growth_map
 from star.cli import main
 from star.config import loading
 from star.spec import Spec
-from tests.small import RUN, arrays
+from tests.small import ALONE, RUN, arrays
 
 PAGE = (Path(__file__).parents[2] / "docs" / "your_robot.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r'```\w+ title="([\w.]+)"\n(.*?)```', PAGE, re.DOTALL))
 MODULES = ("room", "arm", "car")
-ALONE = {"commander": {"enabled": False}, "tutor": {"enabled": False, "unroll": 5}}  # for the sake of compilation
 EPOCH = 100 * RUN["trainer"]["num_envs"]
 
 
@@ -32,7 +31,7 @@ def here(tmp_path, monkeypatch):
     """An empty folder with the files of the page and a small run's config."""
     for name, text in FILES.items():
         (tmp_path / name).write_text(text)
-    settings = json.loads(json.dumps(RUN | ALONE | {"env": {"name": "room:make"}}))
+    settings = json.loads(json.dumps(ALONE | {"env": {"name": "room:make"}}))
     settings["trainer"]["total_env_steps"] = 4 * EPOCH
     (tmp_path / "run.yaml").write_text(json.dumps(settings))
     monkeypatch.chdir(tmp_path)

@@ -15,8 +15,10 @@ from star.agent.task import Task
 from star.config import loading
 from star.learners import replay
 from star.learners.replay import Transition
+from star.sgim import selection
 from star.sgim.lessons import Marks
 from star.spec import Spec
+from tests.small import ACTS, GUIDE, demonstrations
 
 K, L, B = 6, 3, 8  # commander.period, tutor.period and trainer.num_envs of the tiny hierarchy
 
@@ -165,29 +167,51 @@ def test_the_tutors_chain_is_cut_where_the_target_or_the_episode_ends(recording)
 class Epoch:
     """The jitted epoch of a configuration, with the number of times it was traced."""
 
-    def __init__(self, env, values, spec=None):
+    def __init__(self, env, values, spec=None, teachers=()):
         self.spec = spec or Spec.of(env.env)
         self.config = loading.parse(values)
         self.traces = 0
 
         def once(agent, state):
             self.traces += 1
-            return epoch.epoch(agent, self.spec, env, state)
+            return epoch.epoch(agent, self.spec, env, state, teachers)
 
         self.one = jax.jit(once)
         self.init = jax.jit(lambda key: levels.init(self.config.hyper(), self.spec, key=key))
 
 
+SGIM = {
+    "goals": True,
+    "strategies": ["autonomous", "babbling", "decomposition"],
+    "teachers": [GUIDE, ACTS],
+    "exploration": True,
+    "refinement": True,
+}
+
+
 @pytest.fixture(scope="module")
 def jitted(breaking_env, tiny):
-    return Epoch(breaking_env, tiny)
+    """All levels, and all that SGIM can do."""
+    teachers = [demonstrations(length=2), demonstrations(1, length=1)]
+    return Epoch(breaking_env, {**tiny, "sgim": SGIM}, teachers=teachers)
 
 
 @pytest.fixture(scope="module")
-def first(jitted):
-    """Start and end of a first epoch."""
-    start = jitted.init(jax.random.key(0))
-    return start, *jitted.one(jitted.config.hyper(), start)
+def course(jitted):
+    """The states of three epochs, and the metrics of each."""
+    states, metrics = [jitted.init(jax.random.key(22))], []  # a region is cut, which is rare in so few epochs
+    for _ in range(3):
+        state, more = jitted.one(jitted.config.hyper(), states[-1])
+        states.append(state)
+        metrics.append(more)
+    return states, metrics
+
+
+@pytest.fixture(scope="module")
+def first(course):
+    """Start and end of the first epoch, and its metrics."""
+    (start, end, *_), (metrics, *_) = course
+    return start, end, metrics
 
 
 def stack(*trees):
@@ -218,7 +242,7 @@ def test_an_epoch_changes_every_level_and_nothing_about_shapes_types_or_structur
 
 def test_metrics_are_finite_scalars_prefixed_by_level(first):
     _, _, metrics = first
-    parts = {"commander", "tutor", "controller", "forward_model", "refinement", "abstraction", "train", "env"}
+    parts = {"commander", "tutor", "controller", "forward_model", "refinement", "abstraction", "sgim", "train", "env"}
     assert {name.split("/")[0] for name in metrics} == parts
     for name, value in metrics.items():
         assert value.shape == () and np.isfinite(value), name
@@ -242,12 +266,27 @@ def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(fi
     assert np.isfinite(items.start[complete]).all() and np.isfinite(items.end[complete]).all()
 
 
-def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neither(jitted, first, tiny):
-    _, state, _ = first
-    state, _ = jitted.one(jitted.config.hyper(), state)
-    other = loading.parse(tiny, {"commander.discount": 0.5, "tutor.reward_scale": 0.3})
-    jitted.one(other.hyper(), state)
+def test_epochs_after_the_first_compile_nothing_and_other_hyperparameters_neither(jitted, course):
+    values = jitted.config.model_dump(mode="json")
+    other = loading.parse(values, {"commander.discount": 0.5, "tutor.reward_scale": 0.3})
+    jitted.one(other.hyper(), course[0][-1])
     assert jitted.traces == 1
+
+
+def test_sgim_follows_the_agent_through_its_epochs(jitted, course):
+    states, metrics = course
+    assert jitted.traces == 1
+    for state in states:
+        jax.tree.map(np.testing.assert_array_equal, state.sgim.abstraction, state.abstraction)
+    for more in metrics:
+        shares = [float(more[f"sgim/share_{name}"]) for name in jitted.config.sgim.names]
+        assert sum(shares) == pytest.approx(1)
+        assert 0 <= float(more["sgim/competence"]) <= 1 and int(more["sgim/refused"]) == 0
+    assert float(states[-1].sgim.episodes.sum()) > 0
+    remembered = selection.competence(states[-1].sgim)
+    assert np.isfinite(remembered).all() and (remembered > 0).any()
+    for name, value in metrics[-1].items():
+        assert np.isfinite(value), name
 
 
 def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
@@ -307,7 +346,7 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
     )
     outcome = Outcome(start=start, lower=start, upper=start, end=end, weight=ones)
     known = state.commander
-    learnt = commander.follow(
+    learnt = jax.jit(commander.follow)(
         config.commander, known, change, known, Finished(decision, outcome), jnp.zeros_like(known.q[0])
     )
     np.testing.assert_array_equal(learnt.q, expected)
@@ -332,7 +371,9 @@ ADJACENCY = {"enabled": True, "hidden": [8], "batch_size": 8, "updates_per_epoch
 
 @pytest.fixture(scope="module")
 def gara(breaking_env, tiny):
-    return Epoch(breaking_env, loading.parse(tiny, {"tutor.enabled": False}).model_dump(mode="json"))
+    """Its regions stay as they are: refinement never asks who is there."""
+    values = loading.parse(tiny, {"tutor.enabled": False, "refinement.enabled": False})
+    return Epoch(breaking_env, values.model_dump(mode="json"))
 
 
 @pytest.fixture(scope="module")

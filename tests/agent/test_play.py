@@ -266,12 +266,11 @@ def scene_of(spec, env_state):
 
 
 @pytest.mark.parametrize("hold", [True, False, "region"])
-def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_env, tiny, hold):
+def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_env, tiny, fresh, hold):
     agent = loading.parse(tiny, {"commander.hold": hold}).hyper()
     spec = Spec.of(breaking_env.env)
 
-    def commanded(key):
-        state = levels.init(agent, spec, key=key)
+    def commanded(state, key):
         playing = levels.of(agent, spec, greedy=True)
         away = jnp.zeros_like(state.commander.q).at[..., 2].set(1.0)  # everybody is sent to region 2
         known = state.commander.replace(q=away)
@@ -286,7 +285,7 @@ def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_e
             agent.commander, playing.task, known, roadmap, memory, seen, Marks(), env_steps=None, key=key
         )
 
-    got = jax.jit(commanded)(jax.random.key(3))
+    got = jax.jit(commanded)(fresh(3), jax.random.key(3))
     at_goal = np.asarray(got.target == got.goal_region)
     sent = np.asarray(got.target) == 2
     inside, free = np.asarray(got.region == got.goal_region), np.arange(B) % 4 != 3
@@ -297,18 +296,17 @@ def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_e
 
 
 @pytest.mark.parametrize("arrival", [True, False])
-def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, tiny, arrival, monkeypatch):
+def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, tiny, fresh, arrival, monkeypatch):
     agent = loading.parse(tiny, {"commander.arrival": arrival}).hyper()
     spec = replace(Spec.of(breaking_env.env), episode_length=7 * L)
 
-    def played(key):
-        state = levels.init(agent, spec, key=key)
+    def played(state, key):
         stay = jnp.broadcast_to(jnp.eye(state.abstraction.capacity)[:, None], state.commander.q.shape)
         monkeypatch.setattr(commander, "settle", lambda *_, **__: state.commander.replace(q=stay))
         look = lambda env_state, subgoal, box, action: (spec.abstract(env_state.obs), box)  # noqa: E731
         return state.abstraction, *play.greedy(agent, spec, breaking_env, state, record=look, key=key)
 
-    abstraction, streams, (path, box) = jax.device_get(jax.jit(played)(jax.random.key(4)))
+    abstraction, streams, (path, box) = jax.device_get(jax.jit(played)(fresh(4), jax.random.key(4)))
     path = np.concatenate([path[::L], spec.abstract(streams.env.obs)[None]])  # where each segment begins, and the end
     lower, early = box.lower[::L], 0
     for b in range(B):
@@ -326,27 +324,25 @@ def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, 
 
 
 def test_the_tutor_draws_subgoals_in_greedy_episodes_where_commands_were_in_vain_and_nowhere_else(
-    breaking_env, tiny, monkeypatch
+    breaking_env, tiny, fresh, monkeypatch
 ):
     agent = loading.parse(tiny, {"tutor.straight": False}).hyper()
     spec = replace(Spec.of(breaking_env.env), episode_length=L)
     odd = jnp.arange(B) % 2 == 1
 
-    def played(in_vain, key):
+    def played(state, in_vain, key):
         monkeypatch.setattr(commander, "in_vain", lambda memory, success: in_vain)
-        state = levels.init(agent, spec, key=jax.random.key(0))
         record = lambda env_state, subgoal, box, action: subgoal  # noqa: E731
         return play.greedy(agent, spec, breaking_env, state, record=record, key=key)[1][0]
 
-    subgoals = [jax.jit(played)(in_vain, jax.random.key(4)) for in_vain in (odd & False, odd, odd | True)]
+    subgoals = [jax.jit(played)(fresh(), in_vain, jax.random.key(4)) for in_vain in (odd & False, odd, odd | True)]
     never, where_odd, always = map(np.asarray, subgoals)
     np.testing.assert_array_equal(where_odd, np.where(odd[:, None], always, never))
     assert (always != never).all()
 
 
-def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
-    agent = loading.parse(tiny).hyper()
-    state = jax.jit(lambda key: levels.init(agent, Spec.of(breaking_env.env), key=key))(jax.random.key(0))
+def test_an_episode_shorter_than_a_period_has_a_plan_too(tiny, fresh):
+    agent, state = loading.parse(tiny).hyper(), fresh()
     roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
     settle = jax.jit(
         partial(commander.settle, agent.commander, state.commander, roadmap), static_argnames="episode_length"
@@ -356,11 +352,34 @@ def test_an_episode_shorter_than_a_period_has_a_plan_too(breaking_env, tiny):
     np.testing.assert_array_equal(short, one)
 
 
-@pytest.mark.parametrize(("retry", "trust"), [(0.9, 0.99), (0.5, 1.0), (1.0, 0.5), (1.0, 1.0)])
-def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(breaking_env, tiny, retry, trust):
-    agent = loading.parse(tiny, {"commander.retry": retry, "commander.trust": trust, "commander.hold": False}).hyper()
+@pytest.fixture(scope="module")
+def told(breaking_env):
+    """The memory of who is told where to go next, having got somewhere; without one, how the episode begins."""
     spec = replace(Spec.of(breaking_env.env), episode_length=40 * L)
-    state = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
+
+    @jax.jit
+    def told(agent, state, memory=None, where=None, success=None):
+        playing = levels.of(agent, spec, greedy=True)
+        streams = play.start(playing, breaking_env, decisions=40, key=jax.random.key(2))
+        seen = scene_of(spec, streams.env)
+        roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
+        if memory is None:
+            return seen, streams.memory, roadmap
+        middles = (state.abstraction.lower + state.abstraction.upper) / 2
+        there = seen._replace(position=middles[where], success=success)
+        memory = memory.replace(clock=jnp.zeros(B, jnp.int32))
+        key = jax.random.key(1)
+        return commander.command(
+            agent.commander, playing.task, state.commander, roadmap, memory, there, Marks(), env_steps=None, key=key
+        )
+
+    return told
+
+
+@pytest.mark.parametrize(("retry", "trust"), [(0.9, 0.99), (0.5, 1.0), (1.0, 0.5), (1.0, 1.0)])
+def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(tiny, fresh, told, retry, trust):
+    agent = loading.parse(tiny, {"commander.retry": retry, "commander.trust": trust, "commander.hold": False}).hyper()
+    state = fresh()
     n, rng = int(state.abstraction.count), np.random.default_rng(0)
     q, visits = rng.uniform(0, 1, state.commander.q.shape), rng.uniform(0, 9, state.commander.q.shape)
     led, rewards = rng.uniform(0, 9, state.commander.model.led.shape), visits * rng.uniform(0, 1, visits.shape)
@@ -370,23 +389,10 @@ def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(breaking_env, ti
         rewards=jnp.asarray(rewards, jnp.float32),
     )
     state = state.replace(commander=state.commander.replace(q=jnp.asarray(q, jnp.float32), model=model))
-    middles = (state.abstraction.lower + state.abstraction.upper) / 2
-    roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
+    seen, memory, roadmap = told(agent, state)
     allowed = np.asarray(roadmap.allowed.greedy)
     route = rng.integers(0, 3, (25, B))  # regions in which decisions are made
     succeeds = rng.random((25, B)) < 0.3
-    playing = levels.of(agent, spec, greedy=True)
-    streams = jax.jit(lambda key: play.start(playing, breaking_env, decisions=40, key=key))(jax.random.key(2))
-    seen, memory = scene_of(spec, streams.env), streams.memory
-
-    @jax.jit
-    def told(memory, where, success):
-        there = seen._replace(position=middles[where], success=success)
-        memory = memory.replace(clock=jnp.zeros(B, jnp.int32))
-        key = jax.random.key(1)
-        return commander.command(
-            agent.commander, playing.task, state.commander, roadmap, memory, there, Marks(), env_steps=None, key=key
-        )
 
     def staying(i, g, j):
         """How likely the command is not to lead out, or the goal in the region not to be reached."""
@@ -401,7 +407,7 @@ def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(breaking_env, ti
     before, target = np.asarray(memory.region), np.zeros(B, int)
     last, vain = [""] * B, 0  # what the last decision came to
     for now, success in zip(route, succeeds, strict=True):
-        memory = told(memory, now, jnp.asarray(success, jnp.float32))
+        memory = told(agent, state, memory, now, jnp.asarray(success, jnp.float32))
         in_vain = commander.in_vain(memory, jnp.asarray(success, jnp.float32))
         for b in range(B):
             if now[b] != before[b] >= 0:

@@ -13,7 +13,7 @@ import yaml
 from star.cli import main
 from star.config import shipped
 from star.config.loading import load, parse
-from tests.small import RUN
+from tests.small import ALONE, RUN
 
 ROOT = Path(__file__).parents[2]
 
@@ -162,7 +162,7 @@ def test_only_the_end_of_a_long_file_is_read(capsys, monkeypatch):
 
 
 def test_what_whole_epochs_make_of_the_env_steps_is_said_and_that_nothing_is_left_to_do(folder, capsys):
-    (folder / "run.yaml").write_text(json.dumps(RUN))
+    (folder / "run.yaml").write_text(json.dumps(ALONE))
     assert main(["train", "run.yaml", "--run-dir", "run", "--total-env-steps", "3e2"]) == 0
     out, err = capsys.readouterr()
     assert err.count("note: trainer.total_env_steps: 300 becomes 480, whole epochs of 240\n") == 1

@@ -13,7 +13,7 @@ from envs.common import plugins
 from envs.common.errors import UserError
 from star.cli import main
 from star.config import loading
-from tests.small import EPOCH, RUN, arrays
+from tests.small import ALONE, EPOCH, RUN, arrays
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto.md"
 LEARNER = ["--controller.learner", "mine:reinforce"]
@@ -24,8 +24,7 @@ def here(tmp_path, monkeypatch):
     """An empty folder with the page's mine.py and a small run's config."""
     text = re.search(r'```python title="mine.py"\n(.*?)```', PAGE.read_text(encoding="utf-8"), re.DOTALL).group(1)
     (tmp_path / "mine.py").write_text(text)
-    alone = {"commander": {"enabled": False}, "tutor": {"enabled": False, "unroll": 3}}  # for the sake of compilation
-    (tmp_path / "run.yaml").write_text(json.dumps(RUN | alone))
+    (tmp_path / "run.yaml").write_text(json.dumps(ALONE))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delenv("STAR_IMPORT", raising=False)

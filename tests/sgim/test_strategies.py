@@ -12,7 +12,6 @@ from envs.common.errors import UserError
 from star.abstraction import regions
 from star.abstraction.regions import Change, Cut, Split
 from star.agent import commander, levels, play, q_learning, tutor, values
-from star.agent import epoch as learning
 from star.agent.decisions import Decision, Roadmap, Scene, Successors
 from star.config import loading
 from star.learners import ppo, td3
@@ -20,13 +19,12 @@ from star.learners.replay import Imitation, Transition
 from star.sgim import lessons, selection, strategies
 from star.sgim.lessons import Marks
 from star.sgim.sections import SgimConfig
-from star.sgim.teachers import Demonstrations, nearest
+from star.sgim.teachers import nearest
 from star.spec import Spec
+from tests.small import ACTS, GUIDE, demonstrations
 
 B, L = 64, 3
-GUIDE = {"name": "guide", "kind": "decomposition"}
 AIMS = {"name": "aims", "kind": "outcome", "source": "demos.npz"}
-ACTS = {"name": "acts", "kind": "action", "source": "demos.npz"}
 
 
 assign = jax.jit(strategies.assign)
@@ -36,20 +34,6 @@ learn = jax.jit(lessons.learn)
 @cache
 def four_regions():
     return regions.create(((0.0, 0.0), (4.0, 4.0)), ((2.0,), (2.0,)), max_regions=6)
-
-
-def demonstrations(seed=0, n=5, length=L):
-    rng = np.random.default_rng(seed)
-    points = lambda *shape: jnp.asarray(rng.uniform(0, 4, (*shape, 2)), jnp.float32)  # noqa: E731
-    lengths = jnp.asarray(rng.integers(1, 7, n))
-    return Demonstrations(
-        starts=points(n),
-        outcomes=points(n),
-        waypoints=points(n, length),
-        states=jnp.asarray(rng.normal(size=(n, 8, 4)), jnp.float32),
-        actions=jnp.asarray(rng.normal(size=(n, 8, 2)), jnp.float32),
-        lengths=lengths,
-    )
 
 
 def settings(**values):
@@ -427,55 +411,8 @@ def test_what_does_not_fit_is_refused_in_one_line(values, told):
     assert told in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.fixture(scope="module")
-def schooled(tiny, breaking_env):
-    """Three epochs of the tiny hierarchy with all that SGIM can do, states and metrics, and how often it compiled."""
-    everything = {
-        "sgim": {
-            "goals": True,
-            "strategies": ["autonomous", "babbling", "decomposition"],
-            "teachers": [GUIDE, ACTS],
-            "exploration": True,
-            "refinement": True,
-        }
-    }
-    parsed = loading.parse({**tiny, **everything})
-    spec = Spec.of(breaking_env.env)
-    teachers = [demonstrations(length=2), demonstrations(1, length=1)]
-    traces = []
-
-    @jax.jit
-    def epoch(state):
-        traces.append(0)
-        return learning.epoch(parsed.hyper(), spec, breaking_env, state, teachers)
-
-    # With this key a region is cut, which is rare in so few epochs.
-    state = jax.jit(lambda key: levels.init(parsed.hyper(), spec, key=key))(jax.random.key(22))
-    seen, metrics = [state], []
-    for _ in range(3):
-        state, more = epoch(state)
-        seen.append(state)
-        metrics.append(more)
-    return parsed, seen, metrics, len(traces)
-
-
-def test_sgim_follows_the_agent_through_its_epochs(schooled):
-    parsed, seen, metrics, traces = schooled
-    assert traces == 1
-    for state in seen:
-        jax.tree.map(np.testing.assert_array_equal, state.sgim.abstraction, state.abstraction)
-    for more in metrics:
-        shares = [float(more[f"sgim/share_{name}"]) for name in parsed.sgim.names]
-        assert sum(shares) == pytest.approx(1)
-        assert 0 <= float(more["sgim/competence"]) <= 1 and int(more["sgim/refused"]) == 0
-    assert float(seen[-1].sgim.episodes.sum()) > 0
-    remembered = selection.competence(seen[-1].sgim)
-    assert np.isfinite(remembered).all() and (remembered > 0).any()
-
-
-def test_sgim_follows_every_cut_of_the_agents_regions(tiny, breaking_env):
-    agent, spec = loading.parse({**tiny, "sgim": {"goals": True}}).hyper(), Spec.of(breaking_env.env)
-    before = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
+def test_sgim_follows_every_cut_of_the_agents_regions(fresh):
+    before = fresh(sgim={"teachers": [GUIDE]})
     last = int(before.abstraction.count)
     cuts = [Cut(jnp.int32(15), jnp.int32(0), jnp.float32(9.0)), Cut(jnp.int32(last), jnp.int32(1), jnp.float32(5.0))]
     undone = Cut(jnp.int32(3), jnp.int32(0), jnp.float32(-2.0))
@@ -520,7 +457,7 @@ def commanded_in(playing, state, streams, lesson, *, key):
     return memory, marks, roadmap
 
 
-def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(tiny, breaking_env):
+def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(tiny, breaking_env, fresh):
     agent, spec = (
         loading.parse({**tiny, "sgim": {"teachers": [GUIDE], "waypoint_radius": 0.01}}).hyper(),
         Spec.of(breaking_env.env),
@@ -528,18 +465,17 @@ def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(t
     n = breaking_env.num_envs
     lesson = jax.tree.map(lambda x: x[:n], lesson_of(agent.sgim)[0])
     led = np.asarray(lessons.guided(agent.sgim, lesson))
-    playing = levels.of(agent, spec)
+    playing, state = levels.of(agent, spec), fresh(sgim={"teachers": [GUIDE]})
 
     @jax.jit
-    def commanded(key, waypoints):
-        state = levels.init(agent, spec, key=key)
+    def commanded(state, key, waypoints):
         streams = play.start(playing, breaking_env, decisions=1, key=key)
         memory, *_ = commanded_in(playing, state, streams, lesson.replace(waypoints=waypoints), key=key)
         return state.abstraction, spec.goal_point(streams.env.obs), memory
 
-    _, goal, _ = commanded(jax.random.key(0), lesson.waypoints)
+    _, goal, _ = commanded(state, jax.random.key(0), lesson.waypoints)
     beside = jnp.asarray([[-0.1, 0.1], [0.3, 0.1]])[None] * jnp.ones((n, 1, 1))  # two regions on, then to the goal
-    table, _, after = commanded(jax.random.key(0), jnp.concatenate([beside, goal[:, None]], axis=1))
+    table, _, after = commanded(state, jax.random.key(0), jnp.concatenate([beside, goal[:, None]], axis=1))
     locate = lambda p: int(regions.locate(table, jnp.asarray(p, jnp.float32)))  # noqa: E731
     for b in np.flatnonzero(led):
         corners = [after.start[b], *beside[b], goal[b]]
@@ -548,7 +484,7 @@ def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(t
         assert int(after.target[b]) == onward != int(after.goal_region[b])
         np.testing.assert_array_equal(after.box.lower[b], table.lower[onward])
         np.testing.assert_array_equal(after.box.upper[b], table.upper[onward])
-    *_, direct = commanded(jax.random.key(0), jnp.repeat(goal[:, None], 3, axis=1) + 0.5)
+    *_, direct = commanded(state, jax.random.key(0), jnp.repeat(goal[:, None], 3, axis=1) + 0.5)
     arriving = led & (np.asarray(direct.target) == np.asarray(direct.goal_region))
     assert arriving.any()
     np.testing.assert_allclose(direct.box.centre[arriving], goal[arriving], atol=1e-4)  # as without a teacher
@@ -604,9 +540,8 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
     assert nothing is None
 
 
-def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, breaking_env):
-    agent, spec = loading.parse({**tiny, "sgim": {"teachers": [GUIDE]}}).hyper(), Spec.of(breaking_env.env)
-    state = jax.jit(lambda key: levels.init(agent, spec, key=key))(jax.random.key(0))
+def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, fresh):
+    agent, state = loading.parse(tiny).hyper(), fresh(sgim={"teachers": [GUIDE]})
     i, j = map(
         int,
         np.argwhere(np.asarray(regions.adjacent(state.abstraction)) & ~np.eye(len(state.graph.told), dtype=bool))[0],
@@ -651,8 +586,3 @@ def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, 
     np.testing.assert_array_equal(decision.aside, detour)
     for told in (decision.weight, finished(jax.random.key(0), 1.0).decision.lost, outcome.weight):
         np.testing.assert_array_equal(np.asarray(told) > 0, ~babbling)
-
-
-def test_everything_that_learns_stays_finite(schooled):
-    for name, value in schooled[2][-1].items():
-        assert np.isfinite(value), name

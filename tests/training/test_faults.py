@@ -29,6 +29,8 @@ from star.training.journal import Journal, of_epoch
 from star.training.program import Functions
 from tests.small import EPOCH, RUN
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 TD3 = {"hidden": [8], "batch_size": 8, "buffer_size": 64, "min_transitions": 1, "updates_per_rollout": 1}
 ALL_LEVELS = parse(
     RUN,

@@ -39,10 +39,12 @@ from star.training.side_by_side import SideBySide
 from tests.small import EPOCH, RUN, unpacked
 
 ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.usefixtures("undrawn")
 TIMES = ("wall_s", "env_steps_per_s")
 # Like the runs of older formats in `tests/data`, whose epoch is then compiled once for all.
 TINY = RUN | {
     "tutor": RUN["tutor"] | {"straight": False},
+    "refinement": RUN["refinement"] | {"separate": False},
     "sgim": {
         "goals": True,
         "strategies": ["autonomous", "babbling"],
@@ -52,12 +54,15 @@ TINY = RUN | {
     | {"checkpoint_every": 2, "num_seeds": 2, "keep_checkpoints": 3, "sinks": ["tensorboard"]},
 }
 
+# One seed, nobody who teaches or chooses goals, and the same regions all the time: it compiles in a third of the time.
+STEADY = RUN | {"refinement": {"enabled": False}}
+
 
 def tiny(**overrides):
     return small(TINY, **overrides)
 
 
-def small(values=RUN, **overrides):
+def small(values=STEADY, **overrides):
     return parse(values, {key.replace("__", "."): value for key, value in overrides.items()})
 
 
@@ -82,10 +87,10 @@ def finished(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory):
-    """A run of one seed whose teacher and choice of goals are left out: it compiles in a third of the time."""
-    run_dir = tmp_path_factory.mktemp("runs") / "alone"
-    trainer.train(parse(RUN), run_dir, quiet=True)
+def steady(tmp_path_factory):
+    """A run of one seed whose regions stay as they are."""
+    run_dir = tmp_path_factory.mktemp("runs") / "steady"
+    trainer.train(small(), run_dir, quiet=True)
     return run_dir
 
 
@@ -356,9 +361,9 @@ def test_a_map_is_kept_whatever_becomes_of_its_file(section, tmp_path):
 
 
 def test_neither_the_length_of_training_episodes_nor_what_was_planned_before_changes_evaluation():
-    shorter = {"env.training.episode_length": 20, "tutor.unroll": 1}
-    one, other = (programs.build(parse(RUN, {"tutor.unroll": 1} | more)) for more in ({}, shorter))
-    assert (one.experiment.spec.episode_length, other.experiment.spec.episode_length) == (60, 20)
+    shorter = {"env.training.episode_length": 30}
+    one, other = (programs.build(parse(STEADY, more)) for more in ({}, shorter))
+    assert (one.experiment.spec.episode_length, other.experiment.spec.episode_length) == (60, 30)
     fresh, shorter_fresh = (program.init(program.seed_keys()) for program in (one, other))
     planned = jax.random.uniform(jax.random.key(0), fresh.commander.q.shape)
     before = fresh.replace(commander=fresh.commander.replace(q=planned))
@@ -366,7 +371,7 @@ def test_neither_the_length_of_training_episodes_nor_what_was_planned_before_cha
     for program, state in ((other, shorter_fresh), (one, before)):
         jax.tree.map(np.testing.assert_array_equal, found, program.evaluate(state, one.evaluation_keys(0)))
     with pytest.raises(UserError, match="tutor.period: 10 does not divide the test episode of 55"):
-        programs.build(parse(RUN, shorter | {"env.options.episode_length": 55}))
+        programs.build(parse(STEADY, shorter | {"env.options.episode_length": 55}))
 
 
 def test_nothing_is_compiled_after_the_first_epoch(caplog):
@@ -415,7 +420,7 @@ def test_a_checkpoint_of_another_shape_or_environment_is_refused(finished, overr
     assert (run_dir / "metrics.jsonl").read_bytes() == before
 
 
-def test_four_devices_train_as_one_does_and_any_number_goes_on(alone, tmp_path):
+def test_four_devices_train_as_one_does_and_any_number_goes_on(steady, tmp_path):
     """Two epochs on four devices, the other two on one; its checkpoint goes to two as well."""
     training = """
 import json, sys
@@ -432,12 +437,12 @@ _, state = checkpoint.load_state(program, run_dir, "last")
 assert all(leaf.sharding.device_set == set(jax.devices()[:2]) for leaf in jax.tree.leaves(state))
 assert jax.device_get(state.epoch).tolist() == [2]
 """
-    run_dir, half = tmp_path / "run", RUN | {"trainer": RUN["trainer"] | {"total_env_steps": 2 * EPOCH}}
+    run_dir, half = tmp_path / "run", STEADY | {"trainer": RUN["trainer"] | {"total_env_steps": 2 * EPOCH}}
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count=4"
     environment = os.environ | {"PYTHONPATH": str(ROOT), "XLA_FLAGS": flags}
     subprocess.run([sys.executable, "-c", training, json.dumps(half), str(run_dir)], env=environment, check=True)
-    trainer.train(parse(RUN), run_dir, resume=True, quiet=True)
-    for ours, theirs in zip(rows(run_dir), rows(alone), strict=True):
+    trainer.train(small(), run_dir, resume=True, quiet=True)
+    for ours, theirs in zip(rows(run_dir), rows(steady), strict=True):
         assert ours.keys() == theirs.keys()
         for key, value in theirs.items():
             assert ours[key] == pytest.approx(value, rel=1e-3, abs=1e-4), key
@@ -539,7 +544,7 @@ def test_the_published_setting_trains_with_subgoals_that_set_a_heading_too(tmp_p
     assert np.isfinite([last["controller/critic_loss"], last["tutor/critic_loss"], last["train/return"]]).all()
 
 
-def test_runs_side_by_side_are_each_what_train_makes_of_them(alone, tmp_path):
+def test_runs_side_by_side_are_each_what_train_makes_of_them(steady, tmp_path):
     """They differ in numbers of all levels and in the seed; one is given up half-way for another."""
     numbers = {
         "controller__ppo__learning_rate": 2e-3,
@@ -559,7 +564,7 @@ def test_runs_side_by_side_are_each_what_train_makes_of_them(alone, tmp_path):
         for slot, table in enumerate(bench.advance()):
             rows_of[slot].extend(table)
     trainer.train(other, tmp_path / "other", quiet=True)
-    for found, run_dir in ((rows_of[0][2:], alone), (rows_of[1][:4], tmp_path / "other")):
+    for found, run_dir in ((rows_of[0][2:], steady), (rows_of[1][:4], tmp_path / "other")):
         for row, expected in zip(found, rows(run_dir), strict=True):
             assert row.keys() == expected.keys()
             for key, value in row.items():
