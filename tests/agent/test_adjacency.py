@@ -34,7 +34,7 @@ def test_cells_of_one_decision_are_adjacent_and_those_after_its_end_are_not(fres
     alive = np.ones((3, 5), np.float32)
     alive[1:, 2] = 0
     alive[2:, 3] = 0
-    seen = adjacency.observe(settings(), fresh, SPACE, jnp.asarray(path), jnp.asarray(alive)).adjacent
+    seen = jax.jit(lambda *walked: adjacency.observe(settings(), fresh, SPACE, *walked).adjacent)(path, alive)
     cell = np.asarray(adjacency.locate(settings(), SPACE, path))
     expected = np.zeros((24, 24), bool)
     for b in range(5):

@@ -44,7 +44,7 @@ def test_doing_what_was_done_leads_where_it_led(recorded):
         step = lambda data, action: (moved := env.body.step(data, action), env.body.observe(moved, 0))  # noqa: E731
         return jax.lax.scan(step, start, actions)[1]
 
-    states = jax.jit(jax.vmap(again))(demos.states[:, 0], demos.actions)
+    states = np.asarray(jax.jit(jax.vmap(again))(demos.states[:, 0], demos.actions))
     for n, length in enumerate(demos.lengths):
         np.testing.assert_allclose(states[n, :length], demos.states[n, 1 : length + 1], atol=1e-4)
         assert (demos.states[n, length:] == demos.states[n, length]).all()

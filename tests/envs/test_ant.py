@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 import envs
+from tests.made import jitted, made
 
 
 @pytest.fixture(scope="module")
 def env():
-    return envs.make("ant_maze", engine="native")
+    return made("ant_maze")
 
 
 def test_state_is_qpos_qvel_and_the_clock(env):
-    state, step = env.reset(jax.random.key(0)), jax.jit(env.step)
+    state, step = jitted(env.reset)(jax.random.key(0)), jitted(env.step)
     for _ in range(2):
         state = step(state, jnp.zeros(8))
     data = state.pipeline_state.data
@@ -35,7 +36,7 @@ def test_starts_are_noisy_around_the_published_pose(env):
 
 
 def test_each_action_pushes_its_own_joint_with_thirty_newton_metres(env):
-    state = env.reset(jax.random.key(0))
+    state = jitted(env.reset)(jax.random.key(0))
     data = state.pipeline_state.data
     qpos = data.qpos.at[2].set(2.0).at[7:].set(jnp.array([0, 0.9, 0, -0.9, 0, -0.9, 0, 0.9]))  # in the air, at ease
     data = data.replace(qpos=qpos, qvel=jnp.zeros_like(data.qvel))

@@ -72,7 +72,7 @@ def test_an_empty_result_must_be_like_the_argument():
 def test_environments_share_out_nothing_without_elements():
     env = envs.make("ant_maze", engine="native")
     batch = VectorEnv(env, 2, auto_reset=False)
-    state = jax.vmap(batch.reset)(jax.random.split(jax.random.key(0), 2))
+    state = jax.eval_shape(jax.vmap(batch.reset), jax.random.split(jax.random.key(0), 2))
     assert any(leaf.size == 0 for leaf in jax.tree.leaves(state)), "else there is nothing to see"
     seen = list(shared(under_vmap(batch.step, state, jnp.zeros((2, 2, env.action_size))).jaxpr))
     assert len(seen) > 20 and all(array.size for array in seen)

@@ -115,10 +115,11 @@ def test_on_a_map_of_ones_own_goals_success_and_regions_follow_the_map():
 def test_on_a_map_with_a_gap_nobody_in_it_is_near_a_goal():
     rows = "block: yz\nmap: |\n  1111\n  1r01\n  10B1\n  1##1\n  1001\n  1111"
     env = envs.make("ant_maze", engine="native", map=rows)
-    goals = np.asarray(jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 100)).obs[:, -2:])
+    state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 100))
+    goals = np.asarray(state.obs)[:, -2:]
     assert len(np.unique(goals, axis=0)) == 5
     assert (np.abs(goals[:, 1] - np.clip(goals[:, 1], 12.3, 19.7)) > env.success_radius).all()
-    jax.jit(env.step)(env.reset(jax.random.key(0)), jax.numpy.zeros(8))  # such a model can be stepped
+    jax.jit(jax.vmap(env.step))(state, np.zeros((100, 8)))  # such a model can be stepped
 
 
 def test_without_marked_goals_the_test_goal_is_the_longest_walk_away():

@@ -150,8 +150,9 @@ def test_a_simulation_that_explodes_turns_non_finite(body, tmp_path, monkeypatch
 def test_nested_vmaps_equal_one_flat_batch(body):
     qpos, qvel, ctrl = random_starts(body.physics.model, 6)
     data = simulations(body.physics, qpos, qvel)
-    flat = jax.vmap(body.physics.step)(data, jnp.asarray(ctrl))
-    nested = jax.vmap(jax.vmap(body.physics.step))(
-        *jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), (data, jnp.asarray(ctrl)))
+    data, ctrl = jax.device_get(data), ctrl.astype(np.float32)
+    flat = jax.jit(jax.vmap(body.physics.step))(data, ctrl)
+    nested = jax.jit(jax.vmap(jax.vmap(body.physics.step)))(
+        *jax.tree.map(lambda leaf: leaf.reshape(2, 3, *leaf.shape[1:]), (data, ctrl))
     )
     np.testing.assert_array_equal(np.asarray(nested.qpos).reshape(6, -1), flat.qpos)

@@ -13,6 +13,7 @@ import envs
 from envs import maze
 from envs.places import Places
 from envs.tasks import TASKS
+from tests.made import jitted, made
 
 DRAWS = 10_000
 ANT_TASKS = [name for name in envs.names() if name.startswith("ant_")]
@@ -107,7 +108,7 @@ def test_jaxgcrl_mazes_keep_their_first_index_as_x():
 
 
 def test_cells_of_another_size_scale_x_and_y_and_leave_heights():
-    env = envs.make("ant_fall", engine="native", cell=4.0, goals="test")
+    env = made("ant_fall", cell=4.0, goals="test")
     assert [corner.tolist() for corner in env.space] == [[-2.0, -2.0, 0.0], [6.0, 14.0, 8.0]]
     assert env.region_cuts == ((2.0,), (8.0,), ()) and env.subgoal_scale == (5.0, 5.0, 0.5)
     assert jax.jit(env.reset)(jax.random.key(0)).obs[-3:].tolist() == [0.0, 13.5, 4.5]
@@ -116,8 +117,8 @@ def test_cells_of_another_size_scale_x_and_y_and_leave_heights():
 
 
 def test_sparse_reward_pays_success_and_only_that():
-    env = envs.make("point_maze", reward="sparse", success_radius=2.0)
-    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
+    env = made("point_maze", reward="sparse", success_radius=2.0)
+    state, step = jitted(made("point_maze").reset)(jax.random.key(0)), jax.jit(env.step)
     for goal, paid in (((0.0, 1.5), 1.0), ((0.0, 2.5), 0.0)):
         after = step(state.replace(info={**state.info, "goal": jnp.array(goal)}), jnp.zeros(2))
         assert (float(after.reward), float(after.metrics["success"])) == (paid, paid)
@@ -136,15 +137,15 @@ def test_rewards_of_arrays_are_those_of_single_goals():
 
 
 def test_noise_on_positions_has_the_given_size_and_is_off_by_default():
+    states = jax.jit(jax.vmap(made("point_maze").reset))(jax.random.split(jax.random.key(0), 500))
+
     def travelled(**options):
-        env = envs.make("point_maze", **options)
-        states = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 500))
         still = states.replace(
             pipeline_state=states.pipeline_state.replace(
                 data=states.pipeline_state.data.replace(velocity=jnp.zeros((500, 2)))
             )
         )
-        step = jax.jit(jax.vmap(env.step))
+        step = jax.jit(jax.vmap(made("point_maze", **options).step))
         after = step(step(still, jnp.zeros((500, 2))), jnp.zeros((500, 2)))
         return np.asarray(after.obs[:, :2] - still.obs[:, :2])
 
@@ -161,10 +162,10 @@ def test_noise_moves_the_ant_too():
 
 
 def test_the_action_scale_multiplies_actions():
-    point = envs.make("point_maze", action_scale=0.5)
-    state = jax.jit(point.reset)(jax.random.key(0))
-    half = jax.jit(point.step)(state, jnp.ones(2)).obs
-    np.testing.assert_allclose(half, jax.jit(envs.make("point_maze").step)(state, 0.5 * jnp.ones(2)).obs, rtol=1e-6)
+    point, slow = made("point_maze"), made("point_maze", action_scale=0.5)
+    state = jitted(point.reset)(jax.random.key(0))
+    half = jax.jit(slow.step)(state, jnp.ones(2)).obs
+    np.testing.assert_allclose(half, jitted(point.step)(state, 0.5 * jnp.ones(2)).obs, rtol=1e-6)
     ant = envs.make("ant_maze", engine="native", action_scale=2.0).body
     np.testing.assert_array_equal(ant.physics.model.actuator_ctrlrange, np.tile([-60.0, 60.0], (8, 1)))
 
@@ -184,8 +185,8 @@ IN_THE_GAP = {1: 16.0, 2: 0.75}
     ("option", "name", "place"), [("flip", "flipped", ON_ITS_BACK), ("fall", "fallen", IN_THE_GAP)]
 )
 def test_a_flipped_or_fallen_ant_ends_the_episode_only_if_asked_and_stays_ended(option, name, place, how):
-    env = envs.make("ant_fall", engine="native", **{option: how})
-    state = jax.jit(env.reset)(jax.random.key(0))
+    env = made("ant_fall", **{option: how})
+    state = jitted(made("ant_fall").reset)(jax.random.key(0))
     data = state.pipeline_state.data
     lost = data.replace(qpos=data.qpos.at[jnp.array([*place])].set(jnp.array([*place.values()])), qvel=0 * data.qvel)
     step = jax.jit(env.step)
@@ -202,8 +203,8 @@ def test_a_flipped_or_fallen_ant_ends_the_episode_only_if_asked_and_stays_ended(
 
 
 def test_dropped_contacts_end_the_episode_and_are_counted_once():
-    env = envs.make("ant_maze", engine="native")
-    state, step = jax.jit(env.reset)(jax.random.key(0)), jax.jit(env.step)
+    env = made("ant_maze")
+    state, step = jitted(env.reset)(jax.random.key(0)), jitted(env.step)
     full = state.replace(
         pipeline_state=state.pipeline_state.replace(
             data=state.pipeline_state.data.replace(overflow=jnp.ones(()))  # native hands it on
@@ -227,7 +228,7 @@ def test_the_full_observation_appends_what_is_hidden(name, extra):
     hidden = state.obs[30 : env.state_dim]
     flag = [0.0] if name == "ant_maze_cam" else []
     np.testing.assert_array_equal(hidden, np.concatenate([data.qpos[15:], data.qvel[14:], flag]))
-    plain = jax.jit(envs.make(name, engine="native").reset)(jax.random.key(0))
+    plain = jitted(made(name).reset)(jax.random.key(0))
     np.testing.assert_array_equal(plain.obs[:30], state.obs[:30])
 
 

@@ -1,3 +1,5 @@
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,25 +8,27 @@ import pytest
 import envs
 from envs.common.errors import UserError
 from envs.maze import MazeEnv
+from tests.made import jitted, made
 
 B = 4
 
 
+@cache
+def batch(name="point_maze", auto_reset=True):
+    return envs.VectorEnv(made(name, episode_length=3), B, auto_reset=auto_reset)
+
+
 @pytest.fixture(scope="module")
 def env():
-    return envs.make("point_maze", episode_length=3)
+    return batch().env
 
 
 def act(env, seed=0):
     return jax.random.uniform(jax.random.key(seed), (B, env.action_size), minval=-1, maxval=1)
 
 
-def stepper(vector):
-    return jax.jit(vector.step)
-
-
 def begin(vector):
-    return jax.jit(vector.reset)(jax.random.key(0))
+    return jitted(vector.reset)(jax.random.key(0))
 
 
 def leaves(tree):
@@ -47,8 +51,8 @@ def rollout(vector, state, actions):
 
 
 def test_finished_environments_begin_new_episodes_with_new_goals(env):
-    vector = envs.VectorEnv(env, B)
-    state, step = begin(vector), stepper(vector)
+    vector = batch()
+    state, step = begin(vector), jitted(vector.step)
     goals = [state.obs[:, env.state_dim :]]
     for _ in range(4):
         for _ in range(env.episode_length):
@@ -60,9 +64,9 @@ def test_finished_environments_begin_new_episodes_with_new_goals(env):
 
 
 def test_final_obs_flags_and_reward_are_those_of_the_finished_step(env):
-    vector, plain = envs.VectorEnv(env, B), envs.VectorEnv(env, B, auto_reset=False)
+    vector, plain = batch(), batch(auto_reset=False)
     state, expected = begin(vector), begin(plain)
-    step, plain_step = stepper(vector), stepper(plain)
+    step, plain_step = jitted(vector.step), jitted(plain.step)
     for seed in range(env.episode_length):
         state, expected = step(state, act(env, seed)), plain_step(expected, act(env, seed))
     np.testing.assert_array_equal(state.info["final_obs"], expected.obs)
@@ -75,8 +79,8 @@ def test_final_obs_flags_and_reward_are_those_of_the_finished_step(env):
 
 
 def test_without_auto_reset_a_step_never_resets(env):
-    vector = envs.VectorEnv(env, B, auto_reset=False)
-    state, step = begin(vector), stepper(vector)
+    vector = batch(auto_reset=False)
+    state, step = begin(vector), jitted(vector.step)
     for _ in range(env.episode_length + 2):
         state = step(state, act(env))
         np.testing.assert_array_equal(state.info["final_obs"], state.obs)
@@ -85,8 +89,8 @@ def test_without_auto_reset_a_step_never_resets(env):
 
 
 def test_only_the_environments_that_finish_are_reset(env):
-    vector = envs.VectorEnv(env, B)
-    step = stepper(vector)
+    vector = batch()
+    step = jitted(vector.step)
     state = step(begin(vector), act(env))
     state = jax.jit(vector.reset_where)(state, jnp.array([True, False, False, False]), jax.random.key(1))
     for _ in range(2):
@@ -97,13 +101,12 @@ def test_only_the_environments_that_finish_are_reset(env):
 
 @pytest.mark.parametrize("name", ["point_maze", "ant_maze"])
 def test_reset_where_resets_everything_of_the_masked_and_nothing_else(name):
-    env = envs.make(name, **({"engine": "native"} if name == "ant_maze" else {}))
-    vector = envs.VectorEnv(env, B, auto_reset=False)
+    vector = batch(name, auto_reset=False)
     mask = np.array([True, False, True, False])
-    reset, step = jax.jit(vector.reset), stepper(vector)
+    reset, step = jitted(vector.reset), jitted(vector.step)
     before = reset(jax.random.key(0))
     for _ in range(2):
-        before = step(before, jnp.ones((B, env.action_size)))
+        before = step(before, jnp.ones((B, vector.env.action_size)))
     after = jax.jit(vector.reset_where)(before, jnp.asarray(mask), jax.random.key(7))
     fresh = reset(jax.random.key(7))
     for old, new, start in zip(leaves(before), leaves(after), leaves(fresh), strict=True):
@@ -111,17 +114,16 @@ def test_reset_where_resets_everything_of_the_masked_and_nothing_else(name):
         np.testing.assert_array_equal(new[mask], start[mask])
 
 
-def test_environments_of_a_batch_differ(env):
-    state = begin(envs.VectorEnv(env, B))
+def test_environments_of_a_batch_differ():
+    state = begin(batch())
     assert len(np.unique(state.obs, axis=0)) == B
 
 
 @pytest.mark.parametrize(("name", "auto_reset"), [("point_maze", True), ("ant_maze", False)])
 def test_a_vmap_over_seeds_equals_a_loop_over_them(name, auto_reset):
-    env = envs.make(name, episode_length=3, **({"engine": "native"} if name == "ant_maze" else {}))
-    vector = envs.VectorEnv(env, B, auto_reset=auto_reset)
+    vector = batch(name, auto_reset)
     states = jax.jit(jax.vmap(vector.reset))(jax.random.split(jax.random.key(0), 3))
-    actions = jax.random.uniform(jax.random.key(1), (3, 5, B, env.action_size), minval=-1, maxval=1)
+    actions = jax.random.uniform(jax.random.key(1), (3, 5, B, vector.env.action_size), minval=-1, maxval=1)
     together = jax.jit(jax.vmap(lambda *seed: rollout(vector, *seed)))(states, actions)
     single = jax.jit(lambda *seed: rollout(vector, *seed))
     seeds = [jax.tree.map(lambda leaf, i=i: leaf[i], (states, actions)) for i in range(3)]
@@ -150,7 +152,7 @@ def test_any_number_of_vmaps_is_one_batch_for_the_environment(monkeypatch):
 
 
 def test_an_action_shared_by_all_seeds_is_broadcast(env):
-    vector = envs.VectorEnv(env, B, auto_reset=False)
+    vector = batch(auto_reset=False)
     state = jax.jit(jax.vmap(vector.reset))(jax.random.split(jax.random.key(0), 3))
     action = act(env)
     shared = jax.jit(jax.vmap(vector.step, in_axes=(0, None)))(state, action)
@@ -160,19 +162,19 @@ def test_an_action_shared_by_all_seeds_is_broadcast(env):
 
 
 def test_typed_keys_are_carried_like_raw_ones(env):
-    vector = envs.VectorEnv(env, B)
+    vector = batch()
     ended = jnp.full((B, env.action_size), jnp.nan)  # ends every episode, so that the carried keys are used
     typed, raw = (
-        stepper(vector)(jax.jit(vector.reset)(key), ended) for key in (jax.random.key(3), jax.random.PRNGKey(3))
+        jitted(vector.step)(jitted(vector.reset)(key), ended) for key in (jax.random.key(3), jax.random.PRNGKey(3))
     )
     np.testing.assert_array_equal(typed.done, np.ones(B))
     np.testing.assert_array_equal(typed.obs, raw.obs)
 
 
 def test_a_key_for_each_environment_begins_the_episode_of_that_environment_alone(env):
-    vector, single = envs.VectorEnv(env, B), envs.VectorEnv(env, 1)
+    vector, single = batch(), envs.VectorEnv(env, 1)
     keys = jax.random.split(jax.random.key(0), B)
-    reset, reset_one = jax.jit(vector.reset), jax.jit(single.reset)
+    reset, reset_one = jitted(vector.reset), jax.jit(single.reset)
     begun = reset(keys)
     np.testing.assert_array_equal(begun.obs, begin(vector).obs)
     np.testing.assert_array_equal(reset(jax.random.key_data(keys)).obs, begun.obs)
@@ -187,7 +189,7 @@ def test_a_key_for_each_environment_begins_the_episode_of_that_environment_alone
 
 @pytest.mark.parametrize("auto_reset", [True, False])
 def test_the_derivative_of_a_batch_is_that_of_each_environment(env, auto_reset):
-    vector = envs.VectorEnv(env, B, auto_reset=auto_reset)
+    vector = batch(auto_reset=auto_reset)
     state, action = begin(vector), 0.5 * act(env)
 
     def rewards(action):
@@ -207,12 +209,11 @@ def test_the_derivative_of_a_batch_is_that_of_each_environment(env, auto_reset):
 
 
 def test_an_engine_without_derivatives_says_so_in_one_line():
-    env = envs.make("ant_maze", engine="native")
-    vector = envs.VectorEnv(env, 2)
+    vector = batch("ant_maze", auto_reset=False)
     state = begin(vector)
     for function in (
         jax.grad(lambda a: vector.step(state, a).reward.sum()),
         jax.jacfwd(lambda a: vector.step(state, a).obs),
     ):
         with pytest.raises(UserError, match='engine: "native" has no derivatives; allowed: jax'):
-            jax.eval_shape(function, jnp.zeros((2, 8)))
+            jax.eval_shape(function, jnp.zeros((B, 8)))

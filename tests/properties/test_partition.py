@@ -14,7 +14,7 @@ from star.abstraction import regions
 from star.abstraction.regions import Cut
 
 CUTS = 1000
-POINTS = 2000
+POINTS = 500
 SPACES = {
     2: (((-4.0, -4.0), (20.0, 20.0)), ((8.0,), (8.0,))),
     3: (((-8.0, 0.0, 0.1), (16.0, 32.0, 5.3)), ((4.0,), (16.0,), ())),
