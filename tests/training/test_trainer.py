@@ -321,7 +321,7 @@ def test_what_sgim_has_chosen_is_written_down(finished):
 @pytest.mark.parametrize(
     ("teacher", "told"),
     [
-        ({"kind": "outcome", "source": "none.npz"}, "none.npz: no such file (did you mean routes.npz?)"),
+        ({"kind": "outcome", "source": "route.npz"}, "route.npz: no such file (did you mean routes.npz?)"),
         ({"kind": "action", "source": "routes.npz"}, "sgim.teachers: routes.npz shows no actions; helper cannot be of"),
     ],
 )
