@@ -192,19 +192,14 @@ def test_goal_selection_alone_refuses_the_modes_that_environments_refuse(mode):
             regions.create(([0.0], [3.0]), [[1.0, 2.0]], max_regions=8)
 
 
-def test_printed_commands_can_be_typed(tmp_path, monkeypatch):
+def test_printed_commands_can_be_typed(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("STAR_IMPORT", raising=False)
     assert command_line.of("evaluate", Path("runs/a b")) == "star evaluate 'runs/a b'"
     (tmp_path / "a b").mkdir()
     (tmp_path / "a b" / "x").touch()
     command = ["train", str(ROOT / "configs/point_maze.yaml"), "--run-dir", str(tmp_path / "a b")]
-    done = subprocess.run(
-        [sys.executable, "-m", "star", *command],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 2 and f"star train --resume '{tmp_path}/a b'" in done.stderr
+    assert cli.main(command) == 2
+    assert f"star train --resume '{tmp_path}/a b'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -392,11 +392,10 @@ def test_a_region_is_cut_besides_where_nobody_passes_and_the_graph_follows(refin
     items, _ = replay.contents(model.ring)
     periods = items.replace(start=start, end=end, weight=jnp.ones(2000))
     model = model.replace(ring=replay.add(model.ring, periods))
-    graph = random_graph(1)
-    never = settings(**{"refinement.min_transitions": 1000})
-    after, _, splits, metrics = refine(never, grid(), graph, model)
+    graph = random_graph(1).replace(stable=jnp.zeros((R, R), bool))  # no pair is examined
+    after, _, splits, metrics = refine(CONFIG, grid(), graph, model)
     assert int(after.count) == 4 and int(metrics["separated"]) == 0 == int(splits.done.sum())
-    chosen = settings(**{"refinement.min_transitions": 1000, "refinement.separate": True})
+    chosen = settings(**{"refinement.separate": True})
     after, told, splits, metrics = refine(chosen, grid(), graph, model)
     assert int(metrics["separated"]) == 1 == int(splits.done.sum()) and int(metrics["splits"]) == 1
     assert int(after.count) == 5
@@ -428,7 +427,7 @@ def goal_boxes(*centres, reached=()):
 
 def test_a_region_that_reaches_a_goal_inside_it_only_from_a_part_is_cut(refine, moving):
     # +6 along x carries (-1.9, ...) to (4.1, ...): the square around (6, 2) inside the circle of 3 is +-2.12.
-    goals = goal_boxes((6.0, 2.0))
+    goals = goal_boxes((6.0, 2.0), (6.0, 2.0))
     abstraction, graph, _, metrics = refine(DEEP, grid(), knowing((0, 0)), moving((6, 0)), goals)
     assert (int(metrics["examined"]), int(metrics["mixed"]), int(metrics["splits"])) == (1, 1, 1)
     assert int(abstraction.count) == 5
@@ -436,8 +435,8 @@ def test_a_region_that_reaches_a_goal_inside_it_only_from_a_part_is_cut(refine, 
 
 
 def test_no_goal_inside_no_verdict_and_no_cut(refine, moving):
-    goals = goal_boxes((14.0, 2.0))  # in region 2
-    abstraction, graph, _, metrics = refine(CONFIG, grid(), knowing((0, 0)), moving((6, 0)), goals)
+    goals = goal_boxes((14.0, 2.0), (14.0, 2.0))  # in region 2
+    abstraction, graph, _, metrics = refine(DEEP, grid(), knowing((0, 0)), moving((6, 0)), goals)
     assert int(abstraction.count) == 4 and int(metrics["mixed"]) == 0
     assert not (graph.verdict != UNKNOWN).any()
     assert float(graph.transitions[0, 0]) < 100  # others get their turn

@@ -1,6 +1,4 @@
 import os
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import envs
 from envs.point import MAX_SPEED, RADIUS, Point, PointState
 from envs.tasks import TASKS
 
@@ -63,25 +62,22 @@ def test_point_slides_along_a_wall_it_pushes_against():
     np.testing.assert_allclose(after.velocity, [1.2, 0.0], atol=1e-6)
 
 
-FREE_MOVES = """
-import jax, numpy as np, envs
-batch = envs.VectorEnv(envs.make("point_maze"), 256, auto_reset=False)
-def step(state, key):
-    action = 0.3 * jax.random.uniform(key, (256, 2), minval=-1)
-    state = batch.step(state, action)
-    return state, (state.obs, action)
-key = jax.random.key(0)
-obs, _ = jax.jit(lambda: jax.lax.scan(step, batch.reset(key), jax.random.split(key, 50))[1])()
-free = (np.abs(obs[..., :2]) < 3.4).all(axis=-1)  # the nearest walls stop a point at 3.5
-assert free.sum() > 10_000
-assert (obs[free][:, 2:4] != 0).all()
-"""
-
-
 @pytest.mark.skipif("fusion_emitters" not in os.environ["XLA_FLAGS"], reason="this XLA has no older emitter of fusions")
 def test_only_walls_stop_a_point_however_a_compiler_rounds_the_end_of_a_move():
-    """In a process of its own, with the emitter of fusions that rounds it unlike where it was computed first."""
-    subprocess.run([sys.executable, "-c", FREE_MOVES], check=True)
+    """With the emitter of fusions that rounds it unlike where it was computed first."""
+    batch = envs.VectorEnv(envs.make("point_maze"), 256, auto_reset=False)
+
+    def step(state, key):
+        action = 0.3 * jax.random.uniform(key, (256, 2), minval=-1)
+        return (state := batch.step(state, action)), state.obs
+
+    def run(key):
+        return jax.lax.scan(step, batch.reset(key), jax.random.split(key, 50))[1]
+
+    obs = np.asarray(jax.jit(run)(jax.random.key(0)))
+    free = (np.abs(obs[..., :2]) < 3.4).all(axis=-1)  # the nearest walls stop a point at 3.5
+    assert free.sum() > 10_000
+    assert (obs[free][:, 2:4] != 0).all()
 
 
 def test_point_reaches_and_keeps_its_commanded_velocity():
