@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -52,7 +53,9 @@ def forget(monkeypatch):
 def test_it_trains_and_resumes_bit_for_bit_where_it_is_trusted(here, monkeypatch, capsys):
     train = ["train", "run.yaml", "--import", "room", "--trainer.checkpoint_every", "1", "--quiet"]
     assert main([*train, "--run-dir", "whole"]) == 0
-    assert main([*train, "--run-dir", "parts", "--total-env-steps", str(2 * EPOCH)]) == 0
+    shutil.copytree("whole", "parts")  # as of a run that was killed in its third epoch
+    for step in (3 * EPOCH, 4 * EPOCH):
+        shutil.rmtree(Path("parts/checkpoints", str(step)))
     forget(monkeypatch)
     for command in (
         ["train", "run.yaml", "--run-dir", "new"],
@@ -66,7 +69,7 @@ def test_it_trains_and_resumes_bit_for_bit_where_it_is_trusted(here, monkeypatch
         assert main(command) == 2
         assert "only a file names it, so it is not imported; type --import room" in capsys.readouterr().err
     assert "room" not in sys.modules and not list(here.glob("new*"))
-    assert main(["train", "--resume", "parts", "--total-env-steps", str(4 * EPOCH), "--import", "room", "--quiet"]) == 0
+    assert main(["train", "--resume", "parts", "--import", "room", "--quiet"]) == 0
     whole, parts = arrays(here / "whole", 4 * EPOCH), arrays(here / "parts", 4 * EPOCH)
     assert whole.keys() == parts.keys()
     for name, array in whole.items():

@@ -13,7 +13,7 @@ import yaml
 from star.cli import main
 from star.config import shipped
 from star.config.loading import load, parse
-from tests.small import ALONE, RUN
+from tests.small import RUN
 
 ROOT = Path(__file__).parents[2]
 
@@ -159,16 +159,3 @@ def test_only_the_end_of_a_long_file_is_read(capsys, monkeypatch):
     run_folder("long", steps=range(240, 10 * 240, 240))
     line = listed(capsys)["long"]
     assert "2 k " in line
-
-
-def test_what_whole_epochs_make_of_the_env_steps_is_said_and_that_nothing_is_left_to_do(folder, capsys):
-    (folder / "run.yaml").write_text(json.dumps(ALONE))
-    assert main(["train", "run.yaml", "--run-dir", "run", "--total-env-steps", "3e2"]) == 0
-    out, err = capsys.readouterr()
-    assert err.count("note: trainer.total_env_steps: 300 becomes 480, whole epochs of 240\n") == 1
-    assert out.startswith("trained 480 env steps")
-    before = (folder / "run/metrics.jsonl").read_text()
-    assert main(["train", "--resume", "run", "--total-env-steps", "240"]) == 0
-    out, err = capsys.readouterr()
-    assert out == "run: already at 480 env steps; nothing to do\n" and "note" not in err
-    assert (folder / "run/metrics.jsonl").read_text() == before

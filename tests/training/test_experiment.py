@@ -98,6 +98,18 @@ def test_it_trains_and_goes_on_bit_for_bit(here):
         np.testing.assert_array_equal(found[name], array, err_msg=name)
 
 
+def test_what_whole_epochs_make_of_the_env_steps_is_said_and_that_nothing_is_left_to_do(here, capsys):
+    assert main(["train", "run.yaml", "--run-dir", "run", "--total-env-steps", "3e1"]) == 0
+    out, err = capsys.readouterr()
+    assert err.count("note: trainer.total_env_steps: 30 becomes 40, whole epochs of 20\n") == 1
+    assert out.startswith("trained 40 pulls")
+    before = Path("run/metrics.jsonl").read_text()
+    assert main(["train", "--resume", "run", "--total-env-steps", "20"]) == 0
+    out, err = capsys.readouterr()
+    assert out == "run: already at 40 pulls; nothing to do\n" and "note" not in err
+    assert Path("run/metrics.jsonl").read_text() == before
+
+
 def test_what_to_type_next_lets_its_module_in_and_can_be_pasted(here, capsys, monkeypatch):
     monkeypatch.setenv("STAR_IMPORT", "")  # noted, so that what a command adds to it goes again
     assert main(["train", "run.yaml", "--run-dir", "a run", "--quiet", "--import", "bandit"]) == 0
