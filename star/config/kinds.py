@@ -20,7 +20,7 @@ from envs.common.errors import UserError, shown
 from star.config.run import RunConfig
 from star.config.section import ConfigError
 
-OURS: Mapping[str, str] = {"star": "star.agent.kind:STAR"}
+OURS: Mapping[str, str] = {"star": "star.agent.kind:STAR", "tutoring": "star.tutoring.kind:TUTORING"}
 """The experiments of this package, imported when they are first needed."""
 
 About = dict[str, Any]

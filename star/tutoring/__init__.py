@@ -1,0 +1,1 @@
+"""Tutoring: exercises chosen by progress, and prerequisites of skills found from scores alone."""
