@@ -31,6 +31,8 @@ from star.tutoring import graphs
 from star.tutoring.sections import DiscoveryConfig
 
 RATES = (0.1, 0.3)  # of running success
+FEATURES = 2 + len(RATES)
+"""F, of each skill before each score."""
 _NEAR_1 = 0.999  # of m in the product over needed skills, so that its logarithm is finite
 Params = dict[str, Array]
 

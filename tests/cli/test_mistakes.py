@@ -15,6 +15,7 @@ from star.cli import command, main
 from star.report import page
 from star.sweeps import work
 from star.training import trainer
+from star.tutoring import discover
 from tests.cli.refused import refusal
 
 ROOT = Path(__file__).parents[2]
@@ -27,6 +28,22 @@ FILES = {
     "sweep.yaml": "config: point.yaml\nparameters: {tutor.period: {choices: [5, 10]}}\n",
     "oddsweep.yaml": "config: point.yaml\nparameters: {tutor.perod: {choices: [5, 10]}}\n",
     "oddkey.yaml": "config: point.yaml\nparametrs: {tutor.period: {choices: [5, 10]}}\n",
+    "skills.csv": "exercise,skill\nsums,add\ntables,multiply\n",
+    "scores.csv": "student,exercise,correct\nann,sums,1\nann,tables,0\n",
+    "nocorrect.csv": "student,exercise,score\nann,sums,1\n",
+    "twocolumns.csv": "student,student,exercise,correct\nann,ann,sums,1\n",
+    "half.csv": "student,exercise,correct\nann,sums,1\nann,tables,0.5\n",
+    "alone.csv": "student,exercise,correct\nann,sums,1\nann,tables,0\nbo,sums,1\n",
+    "short.csv": "student,exercise,correct\nann,sums,1\nann,tables\n",
+    "nobody.csv": "student,exercise,correct\nann,sums,1\n,tables,0\n",
+    "unknown.csv": "student,exercise,correct\nann,sums,1\nann,halves,0\n",
+    "quoted.csv": 'student,exercise,correct\n"ann"x,sums,1\n',
+    "empty.csv": "",
+    "header.csv": "student,exercise,correct\n",
+    "unused.csv": "exercise,skill\nsums,add\ntables,multiply\nunions,sets\n",
+    "twice.csv": "exercise,skill\nsums,add\nsums,add\n",
+    "oneskill.csv": "exercise,skill\nsums,add\ntables,add\n",
+    "taken/graph.json": "precious",
     "runs/bad/config.yaml": "tutor: [",
     "runs/alien/config.yaml": "experiment: their:KIND\n",
 }
@@ -103,6 +120,7 @@ PRINTING = {
     "render": "render point_maze --out new.png",
     "record": "record runs/old --out new.npz",
     "report": "report runs/old --out new.html",
+    "tutor": "tutor discover scores.csv skills.csv",
     "configs": "configs",
     "envs": "envs",
     "settings": "settings",
@@ -122,6 +140,7 @@ def test_output_that_nobody_reads_is_no_error(words, monkeypatch, capsys):
     monkeypatch.setattr(exam_results, "check_groups", lambda groups, configs: None)
     monkeypatch.setattr(exam_tables, "show", lambda rows, comparison, **_: None)
     monkeypatch.setattr(star_commands, "check_output", lambda out, force: None)
+    monkeypatch.setattr(discover, "discover", lambda options, overrides: print("found") or 0)
     for module, name in ((films, "render"), (demonstrations, "record"), (page, "write")):
         monkeypatch.setattr(module, name, lambda *_, **__: "written")
     reading, writing = os.pipe()
