@@ -18,7 +18,9 @@ DESCRIPTION = "List settings: what each does, its type with range or choices, it
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Its arguments."""
-    parser.add_argument("word", nargs="?", default="", help="only settings with this in key or text, such as tutor; or an experiment")
+    parser.add_argument(
+        "word", nargs="?", default="", help="only settings with this in key or text, such as tutor; or an experiment"
+    )
     parser.add_argument("--experiment", default=DEFAULT, metavar="NAME", help="star (default), or MODULE:NAME")
 
 

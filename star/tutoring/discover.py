@@ -38,7 +38,12 @@ def discover(options: argparse.Namespace, overrides: Mapping[str, Any]) -> int:
     with Console(stderr=True).status(f"fitting {config.members} models to {len(found.right):,} scores"):
         graph = of_tables(config, found, seed=options.seed)
     edges = edges_of(found.skills, graph)
-    about = {"students": found.students, "scores": len(found.right), "exercises": len(found.needs), "seed": options.seed}
+    about = {
+        "students": found.students,
+        "scores": len(found.right),
+        "exercises": len(found.needs),
+        "seed": options.seed,
+    }
     write(out, found.skills, edges, about | {"discovery": config.model_dump(mode="json")})
     for edge in edges:
         print(f"{edge['share']:.2f}  {edge['prerequisite']} -> {edge['skill']}")
@@ -101,7 +106,9 @@ def write(out: Path, skills: list[str], edges: list[Edge], about: Mapping[str, A
     shares = {(number[edge["skill"]], number[edge["prerequisite"]]): edge["share"] for edge in edges}
     json_file, graphml_file, png_file = (out / name for name in NAMES)
     with files.whole(json_file) as file:
-        file.write_text(json.dumps({"skills": skills, "edges": edges} | dict(about), indent=1, ensure_ascii=False) + "\n", "utf-8")
+        file.write_text(
+            json.dumps({"skills": skills, "edges": edges} | dict(about), indent=1, ensure_ascii=False) + "\n", "utf-8"
+        )
     with files.whole(graphml_file) as file:
         graphml(skills, edges).write(file, encoding="utf-8", xml_declaration=True)
     with files.whole(png_file) as file:
@@ -132,7 +139,9 @@ def _settings(overrides: Mapping[str, Any]) -> DiscoveryConfig:
     """Those of the models; raises `UserError` for others."""
     for key in overrides:
         if not key.startswith("discovery."):
-            raise UserError(f"--{key}: star tutor discover takes settings of discovery alone; star settings tutoring lists them")
+            raise UserError(
+                f"--{key}: star tutor discover takes settings of discovery alone; star settings tutoring lists them"
+            )
     return parse({"experiment": "tutoring"}, overrides).discovery
 
 

@@ -133,12 +133,13 @@ class Tutoring(Experiment):
 
 
 def earlier_scores(hyper: Any, course: Course, *, key: Array) -> Scores:
-    """Those of students of `course` who had exercises at random."""
+    """Those of students of `course` who chose exercises at random, each with its own preferences among skills."""
     section = hyper.discovery
-    student_key, exercise_key, key = random.split(key, 3)
+    student_key, taste_key, exercise_key, key = random.split(key, 4)
     students = _new_students(hyper, section.students, key=student_key)
     shape = (section.exercises, section.students)
-    exercises = random.randint(exercise_key, shape, 0, len(course.needs))
+    taste = section.preference * random.normal(taste_key, (section.students, hyper.course.skills))
+    exercises = random.categorical(exercise_key, taste @ course.needs.T, shape=shape)
 
     def step(students: Student, given: tuple[Array, Array]) -> tuple[Student, Array]:
         exercise, key = given

@@ -87,7 +87,7 @@ def draw_graph(
             axis.text(x, y, f"{share:.2f}", fontsize=7, ha="center", va="center", color="tab:blue")
     for name, (x, y) in zip(names, at, strict=True):
         axis.text(x, y, literal(name), ha="center", va="center", bbox={"boxstyle": "round", "fc": "white"}, fontsize=9)
-    axis.set(xlim=(-0.7, at[:, 0].max() + 0.7), ylim=(-at[:, 1].max() if False else at[:, 1].min() - 0.5, 0.5))
+    axis.set(xlim=(-0.7, at[:, 0].max() + 0.7), ylim=(at[:, 1].min() - 0.5, 0.5))
     axis.axis("off")
 
 

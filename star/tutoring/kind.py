@@ -26,14 +26,7 @@ TUTORING = Kind(
     agent=lambda config: config.teaching.tutor,
     unit="exercises",
     tables="skills",
-    row={
-        "level": list,
-        "mastered": list,
-        "practised": list,
-        "prerequisites": list,
-        "known": list,
-        "strength": list,
-    },
+    row={"level": list, "mastered": list, "practised": list},
     # SGIM's, before the first exercise of a skill
     may_be_nan=("seen/own/mean",),
     commands={"discover": _lazily("discover", "discover")},

@@ -33,8 +33,12 @@ class StudentsConfig(Section):
     """Simulated students."""
 
     number: Batch = setting(100, "The tutor teaches so many students, each by itself.", unit="students")
-    guess: float = setting(0.2, "An exercise that a student fails is scored right with this chance.", unit="", ge=0, lt=1)
-    slip: float = setting(0.1, "An exercise that a student solves is scored wrong with this chance.", unit="", ge=0, lt=1)
+    guess: float = setting(
+        0.2, "An exercise that a student fails is scored right with this chance.", unit="", ge=0, lt=1
+    )
+    slip: float = setting(
+        0.1, "An exercise that a student solves is scored wrong with this chance.", unit="", ge=0, lt=1
+    )
 
 
 class SkillSelectionConfig(SelectionConfig):
@@ -45,6 +49,7 @@ class SkillSelectionConfig(SelectionConfig):
     )
     per_block: Positive = setting(1, "Each region remembers at most so many episodes of one block.", unit="episodes")
     best: float = setting(0.0, "This share of choices has its goal near a region's best point.", unit="", ge=0, le=1)
+    optimism: float = setting(0.1, "The root of a doubt of 1 is worth at most this.", unit="competence per block", ge=0)
     sharpness: float = setting(1.0, "Choices are drawn in proportion to interest to this power.", unit="", gt=0)
 
 
@@ -57,9 +62,11 @@ class TeachingConfig(Section):
     graph: Literal["true", "found", "none", "wrong"] = setting(
         "true", "The tutor knows the true graph, the one found from earlier students, none, or a random one."
     )
-    rate: float = setting(0.2, "Each score moves the running success by this share of the difference.", unit="", gt=0, le=1)
+    rate: float = setting(
+        0.2, "Each score moves the running success by this share of the difference.", unit="", gt=0, le=1
+    )
     validated: float = setting(0.6, "Above this running success a prerequisite is validated.", unit="", ge=0, le=1)
-    mastered: float = setting(0.9, "Above this running success a skill is practised no more.", unit="", ge=0, le=1)
+    mastered: float = setting(0.8, "Above this running success a skill is practised no more.", unit="", ge=0, le=1)
     next: float = setting(0.8, "Above this running success the fixed tutor goes on.", unit="", ge=0, le=1)
     exercises: Repeats = setting(10, "Each student has so many exercises in an epoch.", unit="exercises")
     selection: SkillSelectionConfig = SkillSelectionConfig()
@@ -68,8 +75,11 @@ class TeachingConfig(Section):
 class DiscoveryConfig(Section):
     """How the graph is found from the scores of earlier students."""
 
-    students: Batch = setting(400, "So many earlier students had exercises at random.", unit="students")
-    exercises: Repeats = setting(300, "Each of them had so many.", unit="exercises")
+    students: Batch = setting(400, "So many earlier students chose exercises at random.", unit="students")
+    exercises: Repeats = setting(300, "Each of them chose so many.", unit="exercises")
+    preference: float = setting(
+        1.0, "Each of them prefers each skill by the logarithm of odds with this deviation.", unit="", ge=0
+    )
     members: Annotated[int, Field(gt=0, le=256)] = setting(
         4, "So many models are fitted, each to students drawn anew.", unit="models"
     )

@@ -51,7 +51,9 @@ def read(scores: Path, skills: Path) -> Tables:
         if correct not in ("0", "1"):
             raise UserError(f"{scores}: line {line}: correct: {shown(correct)} is not allowed: should be 0 or 1")
         if exercise not in needs:
-            raise UserError(f"{scores}: line {line}: exercise {shown(exercise)} needs no skill: {skills} has no such row")
+            raise UserError(
+                f"{scores}: line {line}: exercise {shown(exercise)} needs no skill: {skills} has no such row"
+            )
         row = students.setdefault(student, len(students)), exercises.setdefault(exercise, len(exercises))
         for column, value in zip(columns, (*row, correct == "1", line), strict=True):
             column.append(value)  # type: ignore[arg-type]
@@ -80,9 +82,8 @@ def _needs(path: Path) -> tuple[dict[str, dict[str, int]], dict[str, int]]:
     for line, (exercise, skill) in _rows(path, _SKILLS):
         of = needs.setdefault(exercise, {})
         if skill in of:
-            raise UserError(
-                f"{path}: line {line}: exercise {shown(exercise)} needs skill {shown(skill)} on line {of[skill]} already"
-            )
+            need = f"exercise {shown(exercise)} needs skill {shown(skill)}"
+            raise UserError(f"{path}: line {line}: {need} on line {of[skill]} already")
         of[skill] = line
         first.setdefault(skill, line)
         if len(first) > MOST_SKILLS:
@@ -109,7 +110,9 @@ def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[int, list[str]]]
                 if not row:
                     continue
                 if len(row) != len(header):
-                    raise UserError(f"{path}: line {lines.line_num}: has {len(row)} values; the header has {len(header)}")
+                    raise UserError(
+                        f"{path}: line {lines.line_num}: has {len(row)} values; the header has {len(header)}"
+                    )
                 values = [row[place].strip() for place in places]
                 for name, value in zip(columns, values, strict=True):
                     if not value or not value.isprintable():

@@ -57,12 +57,12 @@ class Found(struct.PyTreeNode):
     """Share of the models whose graphs have the edge."""
 
 
-def discover(
-    config: DiscoveryConfig, needs: Bool[Array, "E n"], scores: Scores, students: int, *, key: Array
-) -> Found:
+def discover(config: DiscoveryConfig, needs: Bool[Array, "E n"], scores: Scores, students: int, *, key: Array) -> Found:
     """The prerequisites among the skills that `needs` gives for each exercise; `students` is their number."""
     seen = features(needs, scores)
-    fits = jax.lax.map(lambda one: fit(config, needs, scores, seen, students, key=one), random.split(key, config.members))
+    fits = jax.lax.map(
+        lambda one: fit(config, needs, scores, seen, students, key=one), random.split(key, config.members)
+    )
     of = lambda strength: graphs.acyclic(strength, config.threshold)  # noqa: E731
     strength = fits.mean(axis=0)
     return Found(parents=of(strength), strength=strength, share=jax.vmap(of)(fits).mean(axis=0))

@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import random
@@ -34,7 +33,11 @@ from star.sgim.selection import Choice, SgimState
 from star.tutoring import graphs
 from star.tutoring.sections import TeachingConfig
 
-RECENT, KEEPS, EXPLORES = 8, 0.75, 0.2  # of ZPDES: scores remembered, share of the old quality kept, choices made evenly
+RECENT, KEEPS, EXPLORES = (
+    8,
+    0.75,
+    0.2,
+)  # of ZPDES: scores remembered, share of the old quality kept, choices made evenly
 
 
 class Plan(struct.PyTreeNode):
@@ -164,7 +167,9 @@ def _by_quality(config: TeachingConfig, plan: Plan, seen: Seen, *, key: Array) -
     return exercise_for(config, plan, seen, skill, key=exercise_key)
 
 
-def _learn_quality(config: TeachingConfig, plan: Plan, seen: Seen, success: Array, needed: Array, score: Array) -> Quality:
+def _learn_quality(
+    config: TeachingConfig, plan: Plan, seen: Seen, success: Array, needed: Array, score: Array
+) -> Quality:
     """Quality follows the gain: the mean of the newer half of the latest scores less that of the older half."""
     scores = jnp.roll(seen.own.scores, -1, axis=-1).at[:, -1].set(score)
     gain = scores[:, RECENT // 2 :].mean(axis=-1) - scores[:, : RECENT // 2].mean(axis=-1)

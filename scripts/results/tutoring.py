@@ -1,0 +1,185 @@
+"""Compare tutors, and see how well prerequisites are found: the tables of docs/tutoring.md.
+
+    python scripts/results/tutoring.py [--graphs 20] [--seed 0] [--out results/tutoring] [-- SETTINGS]
+
+Every tutor teaches the same students on the same graphs, by `star train tutoring/NAME` with SETTINGS. Written are
+tutors.json (lasting levels of each graph, and their curves), discovery.json (precision, recall and AUC of each graph
+and of all pairs together), table.md with 95 % intervals over graphs and whether each claim holds, and levels.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+
+from star.cli.words import split_settings
+from star.config.loading import load
+from star.report.statistics import mean_interval
+from star.training import trainer
+from star.training.journal import Journal
+
+TUTORS = {
+    "random": ("random", {}),
+    "fixed": ("fixed", {}),
+    "progress": ("progress", {}),
+    "zpdes": ("zpdes", {}),
+    "sgim_graph": ("sgim_graph", {}),
+    "sgim_graph, graph found": ("sgim_graph_found", {}),
+    "sgim_graph, no graph": ("sgim_graph", {"teaching.graph": "none"}),
+    "sgim_graph, wrong graph": ("sgim_graph", {"teaching.graph": "wrong"}),
+}
+
+
+def taught(name: str, settings: dict[str, Any], folder: Path, *, seed: int, graphs: int) -> dict[str, Any]:
+    """What one tutor made of the students of all graphs."""
+    config, own = TUTORS[name]
+    settings = {"trainer.seed": seed, "trainer.num_seeds": graphs} | own | settings
+    began, run = time.monotonic(), folder / name.replace(", ", "-").replace(" ", "_")
+    trainer.train(load(f"tutoring/{config}", settings), run, quiet=True)
+    journal = Journal.of(run, tables="skills")
+    rows = journal.metrics.read()
+    steps = sorted({row["env_steps"] for row in rows})
+    of = lambda key, step: [row[key] for row in rows if row["env_steps"] == step]  # noqa: E731
+    result = {
+        "tutor": name,
+        "settings": settings,
+        "level": of("eval/level", steps[-1]),
+        "mastered": of("eval/mastered", steps[-1]),
+        "curve": {str(step): [round(x, 1) for x in of("eval/level", step)] for step in steps},
+        "seconds": round(time.monotonic() - began, 1),
+    }
+    if "graph/auc" in rows[0]:
+        result["graphs"] = {key: of(f"graph/{key}", steps[-1]) for key in ("precision", "recall", "auc")}
+        result["tables"] = [row for row in journal.tables.read() if row["env_steps"] == steps[-1]]
+    return result
+
+
+def discovered(found: dict[str, Any]) -> dict[str, Any]:
+    """How good the graphs are that a tutor found, each and all of their edges together."""
+    tables = found.pop("tables")
+    true, known = ([{tuple(edge) for edge in row[key]} for row in tables] for key in ("prerequisites", "known"))
+    hits = [len(a & b) for a, b in zip(true, known, strict=True)]
+    counts = {"found": list(map(len, known)), "true": list(map(len, true)), "right": hits}
+    pooled = {"precision": sum(hits) / sum(counts["found"]), "recall": sum(hits) / sum(counts["true"])}
+    return {"each": found.pop("graphs"), "edges": counts, "pooled": pooled}
+
+
+def claims(level: dict[str, np.ndarray], graphs: dict[str, Any]) -> list[tuple[str, str, bool]]:
+    """What is to be shown, what was found, and whether it holds."""
+    rows = []
+    for key, least in (("precision", 0.65), ("recall", 0.75), ("auc", 0.85)):
+        value = np.asarray(graphs["each"][key], float)
+        rows.append((f"{key} of the graph found >= {least}", _interval(value, ".2f"), bool(value.mean() >= least)))
+    best = level["sgim_graph"]
+    for other in ("random", "progress", "zpdes", "fixed"):
+        gain = best - level[other]
+        rows.append((f"`sgim_graph` above `{other}`, level", _interval(gain, "+.0f"), mean_interval(gain)[0] > 0))
+    kept = [
+        _ratio(level["sgim_graph, graph found"] - level[other], best - level[other]) for other in ("random", "progress")
+    ]
+    for other, (share, low, high) in zip(("random", "progress"), kept, strict=True):
+        rows.append(
+            (
+                f"graph found keeps >= .7 of the gain over `{other}`",
+                f"{share:.2f} [{low:.2f}, {high:.2f}]",
+                share >= 0.7,
+            )
+        )
+    for other in ("sgim_graph, no graph", "progress"):
+        loss = level["sgim_graph, wrong graph"] - level[other]
+        rows.append(
+            (f"a wrong graph is worse than `{other}`, level", _interval(loss, "+.0f"), mean_interval(loss)[1] < 0)
+        )
+    return rows
+
+
+def _ratio(above: np.ndarray, below: np.ndarray) -> tuple[float, float, float]:
+    """Ratio of two means over graphs, with the 95 % percentile bootstrap of graphs drawn anew."""
+    rows = np.random.default_rng(0).integers(0, len(above), (9999, len(above)))
+    draws = above[rows].mean(axis=1) / below[rows].mean(axis=1)
+    return float(above.mean() / below.mean()), *np.quantile(draws, (0.025, 0.975))
+
+
+def _interval(values: np.ndarray, shape: str) -> str:
+    low, high = mean_interval(values)
+    return f"{values.mean():{shape}} [{low:{shape}}, {high:{shape}}]"
+
+
+def table(tutors: list[dict[str, Any]], graphs: dict[str, Any]) -> str:
+    """Markdown: tutors, then claims."""
+    level = {one["tutor"]: np.asarray(one["level"]) for one in tutors}
+    lines = [
+        "| tutor | level at the end | level, mean over time | skills mastered | seconds |",
+        "|---|---|---|---|---|",
+    ]
+    for one in tutors:
+        course = np.mean(list(one["curve"].values()), axis=0)
+        cells = (
+            _interval(level[one["tutor"]], ".0f"),
+            _interval(course, ".0f"),
+            _interval(np.asarray(one["mastered"]), ".2f"),
+        )
+        lines.append(f"| {one['tutor']} | {' | '.join(cells)} | {one['seconds']:.0f} |")
+    lines += ["", "| to be shown | found | |", "|---|---|---|"]
+    lines += [
+        f"| {what} | {found} | {'holds' if holds else '**fails**'} |" for what, found, holds in claims(level, graphs)
+    ]
+    right, found, true = (sum(graphs["edges"][key]) for key in ("right", "found", "true"))
+    lines += [
+        "",
+        f"Of the {found} edges found in all graphs {right} are right; {right} of the {true} true ones are found.",
+    ]
+    return "\n".join([*lines, ""])
+
+
+def draw(tutors: list[dict[str, Any]], path: Path) -> None:
+    """Mean level over exercises."""
+    figure = Figure(figsize=(7.6, 4.2), layout="constrained")
+    axis = figure.subplots()
+    for number, one in enumerate(tutors):
+        steps = list(map(int, one["curve"]))
+        style = {"color": f"C{number}", "ls": ":" if "graph" in one["tutor"].partition(",")[2] else "-"}
+        axis.plot(steps, [np.mean(levels) for levels in one["curve"].values()], label=one["tutor"], **style)
+    axis.set(xlabel="exercises", ylabel="lasting level, Elo points")
+    axis.grid(alpha=0.3)
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", fontsize="small")
+    figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Teach, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--graphs", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("results/tutoring"))
+    words, settings = split_settings(sys.argv[1:])
+    options = parser.parse_args([word for word in words if word != "--"])
+    tutors = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in TUTORS:
+            tutors.append(taught(name, settings, Path(folder), seed=options.seed, graphs=options.graphs))
+            print(f"{name}: {_interval(np.asarray(tutors[-1]['level']), '.0f')}, {tutors[-1]['seconds']} s", flush=True)
+    found = {one["tutor"]: discovered(one) for one in tutors if "tables" in one}
+    graphs = found["sgim_graph, graph found"]
+    options.out.mkdir(parents=True, exist_ok=True)
+    about = {"graphs": options.graphs, "seed": options.seed, "command": " ".join(["python", *sys.argv])}
+    about |= {"device": jax.default_backend(), "python": platform.python_version(), "jax": jax.__version__}
+    for name, content in (("tutors", {"tutors": tutors}), ("discovery", graphs)):
+        (options.out / f"{name}.json").write_text(json.dumps(about | content) + "\n", encoding="utf-8")
+    (options.out / "table.md").write_text(table(tutors, graphs), encoding="utf-8")
+    draw(tutors, options.out / "levels.png")
+    print(table(tutors, graphs))
+
+
+if __name__ == "__main__":
+    main()

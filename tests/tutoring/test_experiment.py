@@ -1,0 +1,109 @@
+"""Tutoring as an experiment: run folder, resume bit for bit, figures, and what its page says."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from star.cli import main
+from star.config.loading import load, parse
+from star.training.journal import JsonLines
+from tests.small import arrays
+
+ROOT = Path(__file__).parents[2]
+SMALL = {
+    "experiment": "tutoring",
+    "course": {"skills": 4, "exercises": 6, "needs": 4},
+    "students": {"number": 6},
+    "teaching": {"graph": "found", "exercises": 5},
+    "discovery": {"students": 8, "exercises": 10, "members": 2, "steps": 5, "batch": 16},
+    "trainer": {"total_env_steps": 20, "num_seeds": 2, "eval_every": 1, "checkpoint_every": 1},
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run."""
+    folder = tmp_path_factory.mktemp("tutoring")
+    (folder / "small.yaml").write_text(json.dumps(SMALL))
+    assert main(["train", str(folder / "small.yaml"), "--run-dir", str(folder / "whole"), "--quiet"]) == 0
+    return folder / "whole"
+
+
+def test_a_run_goes_on_bit_for_bit(whole, tmp_path):
+    part = tmp_path / "part"
+    shutil.copytree(whole, part)
+    for steps in ("15", "20"):  # as of a run that was killed in its third epoch
+        shutil.rmtree(part / "checkpoints" / steps)
+    lines = (part / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (part / "metrics.jsonl").write_text("".join(lines[:5]))
+    assert main(["train", "--resume", str(part), "--quiet"]) == 0
+    found, expected = arrays(part, 20), arrays(whole, 20)
+    assert found.keys() == expected.keys() >= {"students/level", "seen/success", "seen/own/gains", "plan/parents"}
+    for name, array in expected.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+
+
+def test_the_page_explains_every_metric_of_a_run_and_every_figure(whole):
+    text = (ROOT / "docs/tutoring.md").read_text()
+    told = set(re.findall(r"^\| `([a-z]+/[a-z_]+)`", text, re.MULTILINE))
+    written = set(JsonLines(whole / "metrics.jsonl").read()[-1])
+    assert told == {key for key in written if "/" in key and not key.endswith("/non_finite")}
+    figures = {path.name for path in (whole / "figures").iterdir()}
+    assert figures == {"summary.png", "skills.png", "graph.png"} and all(name in text for name in figures)
+
+
+def test_what_is_measured_is_what_the_tables_say(whole):
+    rows, tables = (JsonLines(whole / name).read() for name in ("metrics.jsonl", "skills.jsonl"))
+    for row, table in zip(rows, tables, strict=True):
+        assert (row["seed"], row["env_steps"]) == (table["seed"], table["env_steps"])
+        assert row["eval/level"] == row["students/level"] == pytest.approx(np.mean(table["level"]), rel=1e-3)
+        assert row["eval/mastered"] == pytest.approx(np.mean(table["mastered"]), abs=1e-3)
+        assert sum(table["practised"]) == pytest.approx(1, abs=1e-3)
+        true, known = ({tuple(edge) for edge in table[key]} for key in ("prerequisites", "known"))
+        assert row["graph/precision"] == pytest.approx(len(true & known) / len(known) if known else 1.0)
+    levels = [row["eval/level"] for row in rows if row["seed"] == 0]
+    assert levels == sorted(levels)  # what lasts is never lost
+
+
+def test_other_commands_work_on_a_run(whole, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "150")
+    assert main(["evaluate", str(whole), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    last = [row["eval/level"] for row in JsonLines(whole / "metrics.jsonl").read() if row["env_steps"] == 20]
+    assert [seed["level"] for seed in found["seeds"]] == pytest.approx(last)
+    assert main(["report", str(whole), "--out", str(tmp_path / "page.html")]) == 0
+    assert '"unit":"exercises"' in (tmp_path / "page.html").read_text()
+    assert main(["ls", str(whole.parent)]) == 0
+    assert re.search(r"whole +4 skills +sgim_graph +2 +level \d+\.\d\d", capsys.readouterr().out.replace("page", ""))
+    assert main(["settings", "tutoring"]) == 0
+    assert {"teaching.selection.sharpness", "discovery.members"} <= {
+        line.split()[0] for line in capsys.readouterr().out.splitlines()
+    }
+
+
+def test_all_tutors_teach_the_same_students_on_the_same_course():
+    import jax
+
+    from star.training import program as programs
+
+    first = None
+    for tutor, graph in (("random", "true"), ("zpdes", "wrong")):
+        overrides = {"teaching.tutor": tutor, "teaching.graph": graph}
+        program = programs.build(parse(SMALL, overrides))
+        state = program.init(program.seed_keys())
+        same = jax.tree.map(np.asarray, (state.course, state.students))
+        first = first or same
+        jax.tree.map(np.testing.assert_array_equal, same, first)
+    assert not np.array_equal(state.plan.parents, state.course.parents)
+
+
+def test_each_shipped_config_has_the_tutor_of_its_name():
+    for path in sorted((ROOT / "configs/tutoring").glob("*.yaml")):
+        config = load(path)
+        named = path.stem.removesuffix("_found")
+        assert config.teaching.tutor == named and config.trainer.total_env_steps == 300
+        assert (config.teaching.graph == "found") == path.stem.endswith("_found")
