@@ -22,6 +22,7 @@ from star.config.loading import fields, load, parse
 from star.sweeps import work
 from star.training import program as programs
 from star.training import trainer
+from star.tutoring import discover
 from tests import small as smaller
 
 ROOT = Path(__file__).parents[1]
@@ -89,6 +90,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr("star.report.page.write", lambda runs, out, **_: "")
     monkeypatch.setattr(work, "run", lambda found, out, **_: work.Summary([], True, {"trial": 0}))
     monkeypatch.setattr(demonstrations, "record", lambda config, run_dir, out, **_: "")
+    monkeypatch.setattr(discover, "discover", lambda options, overrides: 0)
     return tmp_path
 
 
@@ -167,6 +169,7 @@ def test_the_pages_show_how_to_train_resume_evaluate_and_look_things_up():
         "render",
         "record",
         "report",
+        "tutor",
         "settings",
         "configs",
         "envs",
