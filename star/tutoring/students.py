@@ -88,10 +88,11 @@ def softmin(levels: Float[Array, "n"], mask: Bool[Array, "*m n"]) -> Float[Array
     return jnp.where(total > 0, weight @ levels / jnp.where(total > 0, total, 1.0), jnp.inf)
 
 
-def chance(course: Course, levels: Float[Array, "n"]) -> Float[Array, "E"]:
-    """The chance of success of each exercise."""
-    involved = course.needs | (course.needs.astype(jnp.float32) @ course.parents > 0)
-    return jax.nn.sigmoid(_ELO * (softmin(levels, involved) - course.difficulty))
+def chance(course: Course, levels: Float[Array, "n"], exercise: Int[Array, ""]) -> Float[Array, ""]:
+    """The chance of success in an exercise."""
+    needed = course.needs[exercise]
+    involved = needed | (course.parents & needed[:, None]).any(axis=0)
+    return jax.nn.sigmoid(_ELO * (softmin(levels, involved) - course.difficulty[exercise]))
 
 
 def practise(
@@ -99,7 +100,7 @@ def practise(
 ) -> tuple[Student, Bool[Array, ""]]:
     """The student after one exercise, and its score: right or wrong."""
     success_key, score_key = random.split(key)
-    p = chance(course, student.level)[exercise]
+    p = chance(course, student.level, exercise)
     right = random.bernoulli(success_key, p)
     ready = jax.nn.sigmoid(_ELO * (softmin(student.level, course.parents) - MASTERED))
     growth = student.speed * jnp.exp(jnp.where(right, 4.0, 2.0)) * 4.0 * p * (1.0 - p) * ready
