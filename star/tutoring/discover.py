@@ -60,10 +60,10 @@ def of_tables(config: DiscoveryConfig, found: Tables, *, seed: int) -> Found:
         right=jnp.asarray(found.right),
     )
 
-    def run(config: DiscoveryConfig, needs: jax.Array, scores: Scores, key: jax.Array) -> Found:
-        return tracing.discover(config, needs, scores, found.students, key=key)
+    return jax.device_get(_discover(config, jnp.asarray(found.needs), scores, found.students, key=modes.key(seed)))
 
-    return jax.device_get(jax.jit(run)(config, jnp.asarray(found.needs), scores, modes.key(seed)))
+
+_discover = jax.jit(tracing.discover, static_argnums=3)
 
 
 def bounded(found: Tables, *, seed: int) -> Tables:

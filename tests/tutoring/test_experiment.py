@@ -3,14 +3,20 @@
 import json
 import re
 import shutil
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
 import pytest
+from jax import random
 
 from star.cli import main
 from star.config.loading import load, parse
+from star.training import program as programs
 from star.training.journal import JsonLines
+from star.tutoring import graphs, tracing
+from star.tutoring.experiment import Tutoring
+from star.tutoring.tracing import Found
 from tests.small import arrays
 
 ROOT = Path(__file__).parents[2]
@@ -19,9 +25,16 @@ SMALL = {
     "course": {"skills": 4, "exercises": 6, "needs": 4},
     "students": {"number": 6},
     "teaching": {"graph": "found", "exercises": 5},
-    "discovery": {"students": 8, "exercises": 10, "members": 2, "steps": 5, "batch": 16},
+    "discovery": {"students": 8, "exercises": 10, "threshold": 0.2},
     "trainer": {"total_env_steps": 20, "num_seeds": 2, "eval_every": 1, "checkpoint_every": 1},
 }
+
+
+def guessed(config, needs, scores, students, *, key):
+    """A graph in the place of `tracing.discover`, which has tests of its own and takes long to compile."""
+    assert needs.shape == (6, 4) and scores.right.shape == scores.student.shape == (students * 10,)
+    strength = random.uniform(key, (4, 4)) * scores.right.mean()
+    return Found(parents=graphs.acyclic(strength, config.threshold), strength=strength, share=strength)
 
 
 @pytest.fixture(scope="module")
@@ -29,11 +42,15 @@ def whole(tmp_path_factory):
     """A run."""
     folder = tmp_path_factory.mktemp("tutoring")
     (folder / "small.yaml").write_text(json.dumps(SMALL))
-    assert main(["train", str(folder / "small.yaml"), "--run-dir", str(folder / "whole"), "--quiet"]) == 0
-    return folder / "whole"
+    assert signature(guessed).parameters.keys() == signature(tracing.discover).parameters.keys()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracing, "discover", guessed)
+        assert main(["train", str(folder / "small.yaml"), "--run-dir", str(folder / "whole"), "--quiet"]) == 0
+        yield folder / "whole"
 
 
-def test_a_run_goes_on_bit_for_bit(whole, tmp_path):
+def test_a_run_goes_on_bit_for_bit(whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(Tutoring, "figures", lambda *_: {})  # nobody looks at them
     part = tmp_path / "part"
     shutil.copytree(whole, part)
     for steps in ("15", "20"):  # as of a run that was killed in its third epoch
@@ -85,19 +102,12 @@ def test_other_commands_work_on_a_run(whole, tmp_path, capsys, monkeypatch):
     }
 
 
-def test_all_tutors_teach_the_same_students_on_the_same_course():
-    import jax
-
-    from star.training import program as programs
-
-    first = None
-    for tutor, graph in (("random", "true"), ("zpdes", "wrong")):
-        overrides = {"teaching.tutor": tutor, "teaching.graph": graph}
-        program = programs.build(parse(SMALL, overrides))
-        state = program.init(program.seed_keys())
-        same = jax.tree.map(np.asarray, (state.course, state.students))
-        first = first or same
-        jax.tree.map(np.testing.assert_array_equal, same, first)
+def test_all_tutors_teach_the_same_students_on_the_same_course(whole):
+    program = programs.build(parse(SMALL, {"teaching.tutor": "random", "teaching.graph": "wrong"}))
+    state, other = program.init(program.seed_keys()), arrays(whole, 20)
+    for name in ("parents", "needs", "difficulty"):
+        np.testing.assert_array_equal(getattr(state.course, name), other[f"course/{name}"])
+    np.testing.assert_array_equal(state.students.speed, other["students/speed"])
     assert not np.array_equal(state.plan.parents, state.course.parents)
 
 

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import random
 
-from star.tutoring import tracing
+from star.tutoring import discover, tracing
 from star.tutoring.sections import DiscoveryConfig
+from star.tutoring.tables import Tables
 from star.tutoring.tracing import Scores
 from tests.tutoring import slow
 
@@ -75,11 +75,12 @@ def chain(seed, students=150, length=40):
 
 def test_a_prerequisite_is_found_and_the_same_seed_finds_the_same():
     config = DiscoveryConfig(members=2, steps=300, batch=256)
-    find = jax.jit(lambda scores, key: tracing.discover(config, jnp.eye(3, dtype=bool), scores, 150, key=key))
     scores = chain(0)
-    found = find(scores, random.key(0))
+    rows = Tables(
+        ["a", "b", "c"], 150, np.eye(3, dtype=bool), *map(np.asarray, (scores.student, scores.exercise, scores.right))
+    )
+    found, again, other = (discover.of_tables(config, rows, seed=seed) for seed in (0, 0, 1))
     assert np.argwhere(found.parents).tolist() == [[1, 0]]
     assert found.share[1, 0] == 1 and 0.3 < found.strength[1, 0] <= 1 and not found.strength.diagonal().any()
-    again, other = find(scores, random.key(0)), find(scores, random.key(1))
     np.testing.assert_array_equal(found.strength, again.strength)
     assert (found.strength != other.strength).any()
