@@ -35,6 +35,7 @@ TUTORS = {
     "zpdes": ("zpdes", {}),
     "sgim_graph": ("sgim_graph", {}),
     "sgim_graph, graph found": ("sgim_graph_found", {}),
+    "sgim_graph, all edges found": ("sgim_graph_found", {"teaching.sure": 0.0}),
     "sgim_graph, no graph": ("sgim_graph", {"teaching.graph": "none"}),
     "sgim_graph, wrong graph": ("sgim_graph", {"teaching.graph": "wrong"}),
 }
@@ -67,7 +68,7 @@ def taught(name: str, settings: dict[str, Any], folder: Path, *, seed: int, grap
 def discovered(found: dict[str, Any]) -> dict[str, Any]:
     """How good the graphs are that a tutor found, each and all of their edges together."""
     tables = found.pop("tables")
-    true, known = ([{tuple(edge) for edge in row[key]} for row in tables] for key in ("prerequisites", "known"))
+    true, known = ([{tuple(edge[:2]) for edge in row[key]} for row in tables] for key in ("prerequisites", "found"))
     hits = [len(a & b) for a, b in zip(true, known, strict=True)]
     counts = {"found": list(map(len, known)), "true": list(map(len, true)), "right": hits}
     pooled = {"precision": sum(hits) / sum(counts["found"]), "recall": sum(hits) / sum(counts["true"])}
@@ -164,7 +165,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("results/tutoring"))
     words, settings = split_settings(sys.argv[1:])
     options = parser.parse_args([word for word in words if word != "--"])
-    tutors = []
+    tutors: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         for name in TUTORS:
             tutors.append(taught(name, settings, Path(folder), seed=options.seed, graphs=options.graphs))

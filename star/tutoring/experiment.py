@@ -18,7 +18,7 @@ from star.tutoring import graphs, tracing, tutors
 from star.tutoring import students as pupils
 from star.tutoring.sections import Config
 from star.tutoring.students import MASTERED, Course, Student
-from star.tutoring.tracing import Scores
+from star.tutoring.tracing import Found, Scores
 from star.tutoring.tutors import Plan, Seen
 
 
@@ -27,8 +27,8 @@ class State(struct.PyTreeNode):
 
     course: Course
     plan: Plan
-    strength: Float[Array, "n n"]
-    """That of the edges found; 0 where the tutor's graph was not found from scores."""
+    found: Found
+    """The graph found from scores; without edges, if the tutor was told or has none."""
     students: Student
     """[P]"""
     seen: Seen
@@ -51,13 +51,13 @@ class Tutoring(Experiment):
         """A new course and new students; the same for all tutors. If the graph is to be found, it is found here."""
         course_key, student_key, graph_key, key = random.split(key, 4)
         course = pupils.draw_course(hyper.course, key=course_key)
-        parents, strength = _graph(hyper, course, key=graph_key)
+        parents, found = _graph(hyper, course, key=graph_key)
         count = hyper.students.number
         seen = tutors.init(hyper.teaching, hyper.course.skills)
         return State(
             course=course,
             plan=Plan(needs=course.needs, parents=parents),
-            strength=strength,
+            found=found,
             students=_new_students(hyper, count, key=student_key),
             seen=jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), seen),
             practised=jnp.zeros(hyper.course.skills),
@@ -76,8 +76,8 @@ class Tutoring(Experiment):
         )
         metrics = {"students/success": scores.mean()} | _levels(students)
         if hyper.teaching.graph == "found":
-            found = graphs.quality(state.course.parents, state.plan.parents, state.strength)
-            metrics |= {f"graph/{name}": value for name, value in found.items()}
+            good = graphs.quality(state.course.parents, state.found.parents, state.found.strength)
+            metrics |= {f"graph/{name}": value for name, value in good.items()}
         return state, metrics
 
     @over_seeds
@@ -93,9 +93,9 @@ class Tutoring(Experiment):
     def tables(self, hyper: Any, state: State, seeds: Sequence[int]) -> list[dict[str, Any]]:
         """Levels and practice of each skill, and the graphs."""
         lasting = np.asarray(state.students.lasting, float)
-        course, plan = state.course, state.plan
-        arrays = (course.parents, plan.parents, state.strength, state.practised)
-        true, known, strength, practised = (np.asarray(x) for x in arrays)
+        true, known, practised, found = jax.device_get(
+            (state.course.parents, state.plan.parents, state.practised, state.found)
+        )
         return [
             {
                 "seed": seed,
@@ -104,7 +104,10 @@ class Tutoring(Experiment):
                 "practised": practised[i].astype(float).round(4).tolist(),
                 "prerequisites": np.argwhere(true[i]).tolist(),
                 "known": np.argwhere(known[i]).tolist(),
-                "strength": strength[i].astype(float).round(4).tolist(),
+                "found": [
+                    [*map(int, edge), *(round(float(x[i][edge]), 4) for x in (found.strength, found.share))]
+                    for edge in zip(*np.nonzero(found.parents[i]), strict=True)
+                ],
             }
             for i, seed in enumerate(seeds)
         ]
@@ -150,20 +153,21 @@ def earlier_scores(hyper: Any, course: Course, *, key: Array) -> Scores:
     return Scores(student=number.T.ravel(), exercise=exercises.T.ravel(), right=right.T.ravel())
 
 
-def _graph(hyper: Any, course: Course, *, key: Array) -> tuple[Bool[Array, "n n"], Float[Array, "n n"]]:
-    """The graph that the tutor knows, and the strengths of the edges that were found."""
+def _graph(hyper: Any, course: Course, *, key: Array) -> tuple[Bool[Array, "n n"], Found]:
+    """The graph that the tutor obeys, and the one that was found."""
     unknown = jnp.zeros(course.parents.shape)
+    nothing = Found(parents=unknown > 0, strength=unknown, share=unknown)
     wanted = hyper.teaching.graph
     if wanted == "true":
-        return course.parents, unknown
+        return course.parents, nothing
     if wanted == "none":
-        return unknown > 0, unknown
+        return nothing.parents, nothing
     scores_key, other_key = random.split(key)
     if wanted == "wrong":
-        return graphs.draw(hyper.course.skills, key=other_key), unknown
+        return graphs.draw(hyper.course.skills, key=other_key), nothing
     scores = earlier_scores(hyper, course, key=scores_key)
     found = tracing.discover(hyper.discovery, course.needs, scores, hyper.discovery.students, key=other_key)
-    return found.parents, found.strength
+    return found.parents & (found.share >= hyper.teaching.sure), found
 
 
 def _new_students(hyper: Any, count: int, *, key: Array) -> Student:

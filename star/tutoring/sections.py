@@ -62,6 +62,9 @@ class TeachingConfig(Section):
     graph: Literal["true", "found", "none", "wrong"] = setting(
         "true", "The tutor knows the true graph, the one found from earlier students, none, or a random one."
     )
+    sure: float = setting(
+        1.0, "Of a graph found the tutor obeys the edges that this share of models have.", unit="", ge=0, le=1
+    )
     rate: float = setting(
         0.2, "Each score moves the running success by this share of the difference.", unit="", gt=0, le=1
     )
@@ -86,8 +89,10 @@ class DiscoveryConfig(Section):
     steps: Repeats = setting(1000, "Each model takes so many steps.", unit="steps")
     batch: Batch = setting(1024, "Each step is of so many scores.", unit="scores")
     learning_rate: float = setting(0.05, "The first step size of Adam; it falls to 0.", unit="", gt=0)
-    sparsity: float = setting(1e-4, "The loss grows by this for a certain edge.", unit="nats", ge=0)
-    one_way: float = setting(0.01, "The loss grows by twice this for certain edges both ways.", unit="nats", ge=0)
+    sparsity: float = setting(1e-3, "A certain edge costs this, over the number of skills.", unit="nats", ge=0)
+    one_way: float = setting(
+        0.1, "Certain edges both ways cost twice this besides, over the number of skills.", unit="nats", ge=0
+    )
     threshold: float = setting(0.05, "Edges above this strength are kept, but for cycles.", unit="", ge=0, lt=1)
 
 

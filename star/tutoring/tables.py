@@ -46,20 +46,19 @@ def read(scores: Path, skills: Path) -> Tables:
     needs, skill_lines = _needs(skills)
     students: dict[str, int] = {}
     exercises: dict[str, int] = {}
-    columns: tuple[list[int], list[int], list[bool], list[int]] = ([], [], [], [])
-    for line, (student, exercise, correct) in _rows(scores, _SCORES):
+    rows: list[tuple[int, int, bool, int]] = []
+    for line, (who, exercise, correct) in _rows(scores, _SCORES):
         if correct not in ("0", "1"):
             raise UserError(f"{scores}: line {line}: correct: {shown(correct)} is not allowed: should be 0 or 1")
         if exercise not in needs:
             raise UserError(
                 f"{scores}: line {line}: exercise {shown(exercise)} needs no skill: {skills} has no such row"
             )
-        row = students.setdefault(student, len(students)), exercises.setdefault(exercise, len(exercises))
-        for column, value in zip(columns, (*row, correct == "1", line), strict=True):
-            column.append(value)  # type: ignore[arg-type]
-    student, exercise, right, lines = map(np.asarray, columns)
-    if not len(student):
+        number = students.setdefault(who, len(students)), exercises.setdefault(exercise, len(exercises))
+        rows.append((*number, correct == "1", line))
+    if not rows:
         raise UserError(f"{scores}: holds no score; at least 2 of one student are needed")
+    student, which, right, lines = np.asarray(rows).T
     alone = np.flatnonzero(np.bincount(student) == 1)
     if len(alone):
         line = lines[student == alone[0]][0]
@@ -72,7 +71,7 @@ def read(scores: Path, skills: Path) -> Tables:
             raise UserError(f"{skills}: line {line}: skill {shown(skill)} is needed by no exercise of {scores}")
     table = np.array([[skill in needs[exercise] for skill in names] for exercise in exercises], bool)
     order = np.argsort(student, kind="stable")
-    return Tables(names, len(students), table, student[order], exercise[order], right[order])
+    return Tables(names, len(students), table, student[order], which[order], right[order] > 0)
 
 
 def _needs(path: Path) -> tuple[dict[str, dict[str, int]], dict[str, int]]:

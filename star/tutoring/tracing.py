@@ -6,7 +6,7 @@
     involved    v_ej = 1 if exercise e needs j, else 1 - prod_{i needed} (1 - m_ij)
     chance      z = sigma(softmin_v(l) - d_e),  softmin_v(l) = sum_j v_ej e^(-l_j) l_j / sum_j v_ej e^(-l_j)
     score       right with guess + (1 - guess - slip) z
-    loss        cross-entropy + sparsity sum m + one_way sum m_ij m_ji
+    loss        cross-entropy + (sparsity sum m + one_way sum m_ij m_ji) / n
 
 Several models are fitted, each to students drawn anew with replacement (a bootstrap). The strength of an edge is the
 mean of its m, its share that of the models whose own graph has it.
@@ -154,5 +154,5 @@ def _loss(
     surprise = -jnp.where(scores.right, jnp.log(chance), jnp.log1p(-chance))
     m = strengths(params)
     prior = 1e-3 * (jnp.square(params["ability"]).mean() + jnp.square(params["difficulty"]).mean())
-    edges = config.sparsity * m.sum() + config.one_way * (m * m.T).sum()
+    edges = (config.sparsity * m.sum() + config.one_way * (m * m.T).sum()) / len(m)
     return (weight[scores.student] * surprise).mean() + prior + edges

@@ -24,7 +24,7 @@ SMALL = {
     "experiment": "tutoring",
     "course": {"skills": 4, "exercises": 6, "needs": 4},
     "students": {"number": 6},
-    "teaching": {"graph": "found", "exercises": 5},
+    "teaching": {"graph": "found", "sure": 0.3, "exercises": 5},
     "discovery": {"students": 8, "exercises": 10, "threshold": 0.2},
     "trainer": {"total_env_steps": 20, "num_seeds": 2, "eval_every": 1, "checkpoint_every": 1},
 }
@@ -80,8 +80,9 @@ def test_what_is_measured_is_what_the_tables_say(whole):
         assert row["eval/level"] == row["students/level"] == pytest.approx(np.mean(table["level"]), rel=1e-3)
         assert row["eval/mastered"] == pytest.approx(np.mean(table["mastered"]), abs=1e-3)
         assert sum(table["practised"]) == pytest.approx(1, abs=1e-3)
-        true, known = ({tuple(edge) for edge in table[key]} for key in ("prerequisites", "known"))
-        assert row["graph/precision"] == pytest.approx(len(true & known) / len(known) if known else 1.0)
+        true, found = ({tuple(edge[:2]) for edge in table[key]} for key in ("prerequisites", "found"))
+        assert row["graph/precision"] == pytest.approx(len(true & found) / len(found) if found else 1.0)
+        assert [edge[:2] for edge in table["found"] if edge[3] >= 0.3] == table["known"]
     levels = [row["eval/level"] for row in rows if row["seed"] == 0]
     assert levels == sorted(levels)  # what lasts is never lost
 
