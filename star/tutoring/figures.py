@@ -14,6 +14,7 @@ from star.training.figures import literal
 
 Row = Mapping[str, Any]
 Edge = tuple[int, int]
+_PLAIN = {"fc": "white", "ec": "none", "pad": 0.5}
 
 
 def skills_figure(tables: Sequence[Row]) -> Figure:
@@ -84,7 +85,7 @@ def draw_graph(
         axis.add_patch(arrow)
         if told:
             x, y = 0.6 * at[child] + 0.4 * at[parent]
-            axis.text(x, y, f"{share:.2f}", fontsize=7, ha="center", va="center", color="tab:blue")
+            axis.text(x, y, f"{share:.2f}", fontsize=7, ha="center", va="center", color="tab:blue", bbox=_PLAIN)
     for name, (x, y) in zip(names, at, strict=True):
         axis.text(x, y, literal(name), ha="center", va="center", bbox={"boxstyle": "round", "fc": "white"}, fontsize=9)
     axis.set(xlim=(-0.7, at[:, 0].max() + 0.7), ylim=(at[:, 1].min() - 0.5, 0.5))
