@@ -149,7 +149,7 @@ def draw(tutors: list[dict[str, Any]], path: Path) -> None:
     axis = figure.subplots()
     for number, one in enumerate(tutors):
         steps = list(map(int, one["curve"]))
-        style = {"color": f"C{number}", "ls": ":" if "graph" in one["tutor"].partition(",")[2] else "-"}
+        style = {"color": f"C{number}", "ls": ":" if "," in one["tutor"] else "-"}
         axis.plot(steps, [np.mean(levels) for levels in one["curve"].values()], label=one["tutor"], **style)
     axis.set(xlabel="exercises", ylabel="lasting level, Elo points")
     axis.grid(alpha=0.3)
