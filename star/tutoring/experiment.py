@@ -134,6 +134,13 @@ class Tutoring(Experiment):
         found = {"success": mean(rows, "students/success"), "precision": mean(rows, "graph/precision")}
         return {name: f"{value:.2f}" for name, value in found.items() if value is not None}
 
+    def scratch(self, seeds: int) -> Mapping[str, int]:
+        """Bytes of what the models see of earlier students, before the first epoch."""
+        section, skills = self.config.discovery, self.config.course.skills
+        if self.config.teaching.graph != "found":
+            return {}
+        return {"discovery.students": 4 * seeds * section.students * section.exercises * tracing.FEATURES * skills}
+
 
 def earlier_scores(hyper: Any, course: Course, *, key: Array) -> Scores:
     """Those of students of `course` who chose exercises at random, each with its own preferences among skills."""
