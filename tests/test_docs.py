@@ -76,7 +76,6 @@ def folder(tmp_path, monkeypatch):
         for name, text in files(f"docs/{page}.md").items():
             (tmp_path / name).write_text(text)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setenv("STAR_IMPORT", "")
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
     monkeypatch.setattr("star.debugging.turn_on", lambda: None)
     monkeypatch.setattr("star.devices.join", lambda cluster: None)
