@@ -331,7 +331,7 @@ def test_the_examples_of_the_python_page_act_train_evaluate_and_export(run, tmp_
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "NAME").symlink_to(run)
     (tmp_path / "point_maze").write_text(
-        json.dumps(smaller.RUN | {"trainer": smaller.RUN["trainer"] | {"total_env_steps": 240}})
+        json.dumps(smaller.ALONE | {"trainer": smaller.ALONE["trainer"] | {"total_env_steps": 240}})
     )
     act, train, export, read = blocks("docs/python.md", "python")
     names: dict = {}
