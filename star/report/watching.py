@@ -4,7 +4,7 @@
     serve     answers a browser until training ends
 
 The page asks `/changes`, a stream of server-sent events, and loads itself again at each. Films are drawn by
-`star render` in a process of its own, from the newest checkpoint, at the lowest priority.
+`star render` in a process of its own, from the newest checkpoint, at a low priority.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def _newest(run_dir: Path) -> int | None:
 def _draw(run_dir: Path) -> str:
     """Draw a film of the newest checkpoint; returns what went wrong, if anything did."""
     words = ["render", "--run", str(run_dir), "--out", str(run_dir / "figures" / FILM), "--force", "--quiet"]
-    command = ["nice", "-n", "19", sys.executable, "-m", "star", *words, *page.SMALL_FILM]
+    command = ["nice", "-n", "5", sys.executable, "-m", "star", *words, *page.SMALL_FILM]
     done = subprocess.run(command, env=os.environ | {"JAX_PLATFORMS": "cpu"}, capture_output=True, text=True)
     return "".join(done.stderr.strip().splitlines()[-1:]).removeprefix("error: ") if done.returncode else ""
 
