@@ -118,6 +118,8 @@ def test_agents_and_ablations_are_found_and_others_refused():
     assert script.layer("star") == []
     assert script.layer("hiro") == ["--with", "configs/agents/hiro.yaml"]
     assert script.layer("grid") == ["--with", "configs/ablations/grid.yaml"]
+    hiro, tutor = "configs/agents/hiro.yaml", "configs/ablations/td3_tutor.yaml"
+    assert script.layer("hiro+td3_tutor") == ["--with", hiro, "--with", tutor]
     with pytest.raises(SystemExit, match="hirro: no such agent; known are star, "):
         script.layer("hirro")
 

@@ -511,6 +511,12 @@ def test_each_new_transition_may_be_learnt_from_as_often_as_published(learner):
     assert said == {"tutor": 128, "controller": None if learner == "ppo" else 128}
 
 
+@pytest.mark.parametrize("layers", [[], ["paper/many"]])
+def test_the_papers_configs_learn_from_each_transition_as_often_as_published(layers):
+    learners = load("paper/ant_maze", layers=layers).learners()
+    assert [level.settings.samples_per_transition(size) for _, level, size in learners] == [128, 128]
+
+
 def test_a_number_that_float32_cannot_hold_is_refused():
     with pytest.raises(UserError, match=r": tutor.reward_scale: 1e\+300 is not allowed: should lie between"):
         parse({}, {"tutor.reward_scale": 1e300})
