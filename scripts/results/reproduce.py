@@ -61,7 +61,9 @@ def layer(name: str) -> list[str]:
     return found
 
 
-def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace, settings: list[str]) -> dict[str, Any]:
+def measure(
+    task: str, name: str, seeds: list[int], options: argparse.Namespace, settings: list[str], *, goals: str = "test"
+) -> dict[str, Any]:
     """Train and evaluate the consecutive `seeds` of one agent in one program: metrics, evaluation, how it was run."""
     other = [hashlib.sha256(shlex.join(settings).encode()).hexdigest()[:8]] if settings else []
     run = options.runs / task / "-".join([name, *map(str, seeds), *other])
@@ -71,7 +73,7 @@ def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace,
         subprocess.run([*STAR, "train", "--resume", str(run)], cwd=ROOT, check=True)
     else:
         subprocess.run([*STAR, *train, "--run-dir", str(run)], cwd=ROOT, check=True)
-    evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--json"]
+    evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--goals", goals, "--json"]
     report = subprocess.run(evaluate, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     return {
         "rows": JsonLines(run / "metrics.jsonl").read(),
