@@ -51,7 +51,7 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
         episode_length=chosen["episode_length"],
         reward=chosen["reward"],
         success_radius=task.success_radius if radius is None else radius,
-        flip=chosen.get("flip", "ignore"),
-        fall=chosen.get("fall", "ignore"),
+        flip=chosen["flip"],
+        fall=chosen["fall"],
         position_noise=chosen["position_noise"],
     )

@@ -82,6 +82,11 @@ def distances(arena: Arena, starts: np.ndarray, ends: np.ndarray) -> np.ndarray 
     return found
 
 
+def hidden(arena: Arena, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Whether walls or gaps stand straight between `starts` and `ends` [n, 2] (bool [n]); blocks and gates do not."""
+    return _blocked(starts, ends, _runs(arena))
+
+
 def _corners(arena: Arena) -> np.ndarray:
     """The points [n, 2] where a way can turn: the corners of walls and gaps that stick out."""
     solid = _solid(arena)

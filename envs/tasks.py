@@ -140,11 +140,11 @@ COMMON: Mapping[str, Option] = {
     "cell": number(None, *CELL_SIZES, "m"),
     "action_scale": number(1.0, 0.01, 10.0),
     "position_noise": number(0.0, 0.0, 1.0, "m"),
+    "flip": choice(*ENDS),
+    "fall": choice(*ENDS),
 }
 
 ANT: Mapping[str, Option] = {
-    "flip": choice(*ENDS),
-    "fall": choice(*ENDS),
     "preset": choice(*PRESETS),
     "collisions": choice("all", "feet"),
     "timestep": duration(0.02, 1.0),

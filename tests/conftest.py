@@ -29,7 +29,7 @@ from PIL import Image  # noqa: E402
 
 import envs  # noqa: E402
 from envs import arena, opengl  # noqa: E402
-from envs.common import modes  # noqa: E402
+from envs.common import modes, plugins  # noqa: E402
 from envs.maze import MazeEnv  # noqa: E402
 from envs.tasks import TASKS  # noqa: E402
 from star.agent import commander, controller, levels, play, tutor  # noqa: E402
@@ -171,6 +171,12 @@ def compiled(config):
 def with_map(options):
     """These options with the rows of their map instead of its file, which may change."""
     return options | {"map": arena.load(options["map"])} if "map" in options else options
+
+
+@pytest.fixture(autouse=True)
+def nobody_trusted(monkeypatch):
+    """Each test begins with no trusted module, and what its commands trust is forgotten after it."""
+    monkeypatch.setenv(plugins.TRUSTED, "")
 
 
 @pytest.fixture

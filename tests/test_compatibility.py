@@ -192,8 +192,7 @@ def test_goal_selection_alone_refuses_the_modes_that_environments_refuse(mode):
             regions.create(([0.0], [3.0]), [[1.0, 2.0]], max_regions=8)
 
 
-def test_printed_commands_can_be_typed(tmp_path, monkeypatch, capsys):
-    monkeypatch.delenv("STAR_IMPORT", raising=False)
+def test_printed_commands_can_be_typed(tmp_path, capsys):
     assert command_line.of("evaluate", Path("runs/a b")) == "star evaluate 'runs/a b'"
     (tmp_path / "a b").mkdir()
     (tmp_path / "a b" / "x").touch()

@@ -77,12 +77,12 @@ def folder(tmp_path, monkeypatch):
         for name, text in files(f"docs/{page}.md").items():
             (tmp_path / name).write_text(text)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setenv("STAR_IMPORT", "")
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
     monkeypatch.setattr("star.debugging.turn_on", lambda: None)
     monkeypatch.setattr("star.devices.join", lambda cluster: None)
     monkeypatch.setattr(exams, "evaluate", lambda targets, exam, **_: [])
     monkeypatch.setattr(exam_results, "check_groups", lambda groups, configs: None)
+    monkeypatch.setattr("star.report.watching.serve", lambda run_dir, config, **_: None)
     monkeypatch.setattr(exam_results, "compare", lambda rows, groups: None)
     monkeypatch.setattr(exam_tables, "show", lambda rows, comparison, **_: None)
     monkeypatch.setattr(star_commands, "check_output", lambda out, force: None)  # pictures need OpenGL, films ffmpeg
@@ -169,13 +169,14 @@ def test_the_pages_show_how_to_train_resume_evaluate_and_look_things_up():
         "render",
         "record",
         "report",
+        "watch",
         "tutor",
         "settings",
         "configs",
         "envs",
         "completion",
     }
-    assert words | {"completion"} == {words[0] for words in shown}
+    assert words == {words[0] for words in shown}
 
 
 @pytest.mark.parametrize("words", MAKE)
@@ -335,7 +336,7 @@ def test_the_examples_of_the_python_page_act_train_evaluate_and_export(run, tmp_
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "NAME").symlink_to(run)
     (tmp_path / "point_maze").write_text(
-        json.dumps(smaller.RUN | {"trainer": smaller.RUN["trainer"] | {"total_env_steps": 240}})
+        json.dumps(smaller.ALONE | {"trainer": smaller.ALONE["trainer"] | {"total_env_steps": 240}})
     )
     act, train, export, read = blocks("docs/python.md", "python")
     names: dict = {}

@@ -1,9 +1,11 @@
 import argparse
 import collections
 import dataclasses
+import itertools
 import json
 import random
 import shutil
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -118,6 +120,8 @@ def test_agents_and_ablations_are_found_and_others_refused():
     assert script.layer("star") == []
     assert script.layer("hiro") == ["--with", "configs/agents/hiro.yaml"]
     assert script.layer("grid") == ["--with", "configs/ablations/grid.yaml"]
+    hiro, tutor = "configs/agents/hiro.yaml", "configs/ablations/td3_tutor.yaml"
+    assert script.layer("hiro+td3_tutor") == ["--with", hiro, "--with", tutor]
     with pytest.raises(SystemExit, match="hirro: no such agent; known are star, "):
         script.layer("hirro")
 
@@ -167,6 +171,104 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
     (tmp_path / "a" / "notes.json").write_text("not a report", encoding="utf-8")
     script.main(["point_maze", "star", "--out", str(tmp_path / "a"), "--runs", str(tmp_path / "others")])
     assert len((tmp_path / "a" / "curves.jsonl").read_text().splitlines()) == 5
+
+
+TUNE = load("tune")
+
+
+class Lost(Exception):
+    """The machine is gone."""
+
+
+@pytest.fixture
+def tuned(tmp_path, monkeypatch):
+    """Tune HIRO on the Point Maze with a stand-in for training: (programs that were asked for, how to tune)."""
+    worth, asked = {"plain": 0.2, "progress": 0.4, "less_noise": 0.4, "unroll_5": 0.1}, []
+    settings = {name: TUNE.words(one) for name, one in yaml.safe_load(TUNE.CONFIGURATIONS.read_text())["hiro"].items()}
+
+    def measure(task, name, seeds, options, given, *, goals):
+        *own, key, steps = given
+        assert (task, name, goals, key) == ("point_maze", "hiro", "train", "--trainer.total_env_steps")
+        (chosen,) = [one for one, words in settings.items() if words == own]
+        asked.append((chosen, tuple(seeds), int(steps)))
+        if len(asked) == fails_at:
+            raise error
+        score = worth[chosen] if len(seeds) == 2 else 1 - worth[chosen]  # with more env steps it is the other way round
+        rows = [{"seed": seed, "success_behind_walls": score, "success_any": 0.9} for seed in seeds]
+        return {"rows": [{"env_steps": int(steps), "wall_s": 2.0}], "evaluated": rows, "run": {"command": "star train"}}
+
+    fails_at, error = None, Lost()
+    tune = TUNE.tune
+    monkeypatch.setattr(TUNE, "tune", lambda tuning, path, options: tune(tuning, path, options, measure))
+
+    def run(*words, at=None, by=None):
+        nonlocal fails_at, error
+        fails_at, error = at, by or Lost()
+        TUNE.main(["point_maze", "hiro", "--out", str(tmp_path / "tuning.json"), "--env-steps", "100", "200", *words])
+        return json.loads((tmp_path / "tuning.json").read_text())
+
+    return asked, run
+
+
+def test_tuning_halves_twice_with_seeds_of_its_own_and_goes_on_after_a_lost_machine(tuned, tmp_path, capsys):
+    asked, run = tuned
+    with pytest.raises(Lost):
+        run(at=3)
+    assert len(json.loads((tmp_path / "tuning.json").read_text())["programs"]) == 2
+    asked.clear()
+    found = run()
+    first, second = (10, 11), (12, 13, 14)
+    assert asked == [
+        ("less_noise", first, 100), ("unroll_5", first, 100), ("progress", second, 200), ("less_noise", second, 200)
+    ]  # fmt: skip
+    assert [one["score"] for one in found["programs"]] == pytest.approx([0.2, 0.4, 0.4, 0.1, 0.6, 0.6])
+    assert found["chosen"] == "progress" and found["signal"] == "success_behind_walls"
+    assert "chosen: progress" in capsys.readouterr().out
+    before = (tmp_path / "tuning.json").stat()
+    assert run(at=len(asked) + 1) == found and (tmp_path / "tuning.json").stat() == before  # nothing is trained again
+
+
+def test_a_configuration_that_breaks_is_worth_nothing_and_others_go_on(tuned):
+    asked, run = tuned
+    found = run(at=2, by=subprocess.CalledProcessError(TUNE.NOT_FINITE, ["star", "train"]))
+    assert [one["score"] for one in found["programs"]] == pytest.approx([0.2, 0.0, 0.4, 0.1, 0.6, 0.8])
+    assert found["programs"][1]["broke"] == "not finite" and found["chosen"] == "plain" and len(asked) == 6
+    TUNE.table(found)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("point_maze hirro", "hirro: has no configurations in tune.yaml; known are frugal, "),
+        ("point_mase hiro", "configs/point_mase.yaml: no such file"),
+        ("point_maze hiro --out other.json", "other.json: is no tuning; choose another --out"),
+        ("point_maze hiro --out old.json", "old.json: is another tuning, with agent hrac, not hiro; choose another"),
+        ("point_maze hiro -- --tutor.perod 5", "command line: tutor.perod: unknown key (did you mean tutor.period?)"),
+        ("point_maze hiro -- --tutor.period", "--tutor.period: needs a value"),
+    ],
+)
+def test_a_tuning_that_cannot_be_is_refused_in_one_line(tmp_path, capsys, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    Path("other.json").write_text("[]")
+    Path("old.json").write_text(json.dumps({"task": "point_maze", "agent": "hrac"}))
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(SystemExit) as ended:
+        TUNE.main(words.split())
+    line = capsys.readouterr().err
+    assert ended.value.code == 2 and line.startswith(f"error: {said}") and line.count("\n") == 1
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("agent", yaml.safe_load(TUNE.CONFIGURATIONS.read_text()))
+@pytest.mark.parametrize("task", ["ant_maze", "ant_fall"])
+def test_all_agents_are_tuned_with_four_configurations_that_differ(agent, task):
+    options = argparse.Namespace(task=task, agent=agent, signal=None, episodes=9, env_steps=[4_000_000, 8_000_000])
+    plan = TUNE.plan(options, {})
+    layers = load("results/reproduce").layer(agent)[1::2]
+    configs = [loading.load(f"configs/{task}.yaml", one, layers=layers) for one in plan["configurations"].values()]
+    assert len(configs) == 4 and all(config.trainer.num_envs == 512 for config in configs)
+    assert all(one != other for one, other in itertools.combinations(configs, 2))
+    assert plan["signal"] == ("success_any" if task == "ant_fall" else "success_behind_walls")
 
 
 def test_seeds_that_follow_one_another_share_a_program():

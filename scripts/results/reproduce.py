@@ -3,10 +3,11 @@
     python scripts/results/reproduce.py TASK [NAME ...] [--seed 0] [--seeds 5] [--level 0.9] [--one-by-one]
                                          [--out FOLDER] [-- SETTINGS]
 
-TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents, configs/ablations or
-configs/sgim laid over it; by default all agents. SETTINGS are passed on to `star train`. For each name the seeds are
-trained side by side in one program, or with --one-by-one one after another, which is how wall-clock times to a success
-are meant to be taken. Into results/TASK, or results/TASK/one_by_one, go
+TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents, configs/ablations,
+configs/sgim or configs/paper laid over it, or several of these, as hiro+td3_tutor; by default all agents. SETTINGS are
+passed on to `star train`. For each name the seeds are trained side by side in one program, or with --one-by-one one
+after another, which is how wall-clock times to a success are meant to be taken. Into results/TASK, or
+results/TASK/one_by_one, go
 
     NAME.json     every seed's success on `--episodes` greedy episodes on test goals; env steps to success_any `--level`
                   (null: never), seconds of training to it, and seconds since the start of the run, with compilation
@@ -39,7 +40,7 @@ from star.report.statistics import above, over_seeds
 from star.training.journal import Journal, JsonLines
 
 ROOT = Path(__file__).parents[2]
-LAYERS = ("agents", "ablations", "sgim")
+LAYERS = ("agents", "ablations", "sgim", "paper")
 AGENTS = ("star", "hiro", "hrac", "gara", "flat", "flat_td3")
 LEVEL = 0.9  # of success_any, for the time to it, unless said otherwise
 CURVE = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
@@ -48,17 +49,21 @@ STAR = (sys.executable, "-m", "star")
 
 def layer(name: str) -> list[str]:
     """Arguments of `star train` that turn the task's config into that of the agent `name`; SystemExit if unknown."""
-    if name == "star":
-        return []
-    for folder in LAYERS:
-        path = Path("configs") / folder / f"{name}.yaml"
-        if (ROOT / path).is_file():
-            return ["--with", str(path)]
-    known = sorted(path.stem for folder in LAYERS for path in (ROOT / "configs" / folder).glob("*.yaml"))
-    raise SystemExit(f"error: {name}: no such agent; known are star, {', '.join(known)}")
+    found: list[str] = []
+    for part in name.split("+"):
+        if part == "star":
+            continue
+        paths = [path for folder in LAYERS if (ROOT / (path := Path("configs") / folder / f"{part}.yaml")).is_file()]
+        if not paths:
+            known = sorted(path.stem for folder in LAYERS for path in (ROOT / "configs" / folder).glob("*.yaml"))
+            raise SystemExit(f"error: {part}: no such agent; known are star, {', '.join(known)}")
+        found += ["--with", str(paths[0])]
+    return found
 
 
-def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace, settings: list[str]) -> dict[str, Any]:
+def measure(
+    task: str, name: str, seeds: list[int], options: argparse.Namespace, settings: list[str], *, goals: str = "test"
+) -> dict[str, Any]:
     """Train and evaluate the consecutive `seeds` of one agent in one program: metrics, evaluation, how it was run."""
     other = [hashlib.sha256(shlex.join(settings).encode()).hexdigest()[:8]] if settings else []
     run = options.runs / task / "-".join([name, *map(str, seeds), *other])
@@ -68,7 +73,7 @@ def measure(task: str, name: str, seeds: list[int], options: argparse.Namespace,
         subprocess.run([*STAR, "train", "--resume", str(run)], cwd=ROOT, check=True)
     else:
         subprocess.run([*STAR, *train, "--run-dir", str(run)], cwd=ROOT, check=True)
-    evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--json"]
+    evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--goals", goals, "--json"]
     report = subprocess.run(evaluate, cwd=ROOT, check=True, capture_output=True, text=True).stdout
     return {
         "rows": JsonLines(run / "metrics.jsonl").read(),

@@ -26,7 +26,7 @@ def evaluate(
 
     from star.agent import exam_results, exam_tables, exams  # after what can be refused at once
 
-    exam = exams.Exam(grid=_grid(options), seed=options.evaluation_seed, task=task)
+    exam = exams.Exam(**_goals(options), seed=options.evaluation_seed, task=task)
     exam_results.check_groups(groups, configs)
     if out is not None:
         exam_results.check_place(out, force=options.force)
@@ -55,10 +55,11 @@ def measure(run_dir: Path, overrides: Mapping[str, Any], *, checkpoint: str, see
     return exams.evaluate([exams.Target(run_dir, checkpoint, config)], exams.Exam(seed=seed, task=task))
 
 
-def _grid(options: argparse.Namespace) -> int | None:
-    if options.goals == "test" and options.grid is not None:
+def _goals(options: argparse.Namespace) -> dict[str, Any]:
+    """Which goals, as an `Exam` has them."""
+    if options.goals != "grid" and options.grid is not None:
         raise ConfigError("--grid: needs --goals grid")
-    return (options.grid or 8) if options.goals == "grid" else None
+    return {"grid": (options.grid or 8) if options.goals == "grid" else None, "training": options.goals == "train"}
 
 
 def _split_task(overrides: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -72,8 +73,10 @@ def _again(options: argparse.Namespace, overrides: dict[str, Any]) -> list[str]:
     words = []
     if options.evaluation_seed:
         words += ["--evaluation-seed", str(options.evaluation_seed)]
+    if options.goals != "test":
+        words += ["--goals", options.goals]
     if options.goals == "grid":
-        words += ["--goals", "grid", "--grid", str(_grid(options))]
+        words += ["--grid", str(_goals(options)["grid"])]
     for key, value in overrides.items():
         name = "--episodes" if key == "trainer.eval_episodes" else f"--{key}"
         words += [name, value if isinstance(value, str) else json.dumps(value)]
@@ -91,8 +94,8 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         for key in overrides:
             if not key.startswith("env.") and key != "trainer.device":
                 raise ConfigError(f"--{key}: random actions take only env settings and trainer.device")
-        if options.goals == "grid":
-            raise ConfigError("--goals: grid needs --run; random actions take --env.options.goals")
+        if options.goals != "test":
+            raise ConfigError(f"--goals: {options.goals} needs --run; random actions take --env.options.goals")
         if os.path.isfile(Path(options.task, "config.yaml")):
             raise ConfigError(f"star render: {options.task} is a run, not a task; did you mean --run {options.task}?")
         task: dict[str, Any] = {}
@@ -100,7 +103,7 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     else:
         if options.episode is not None and options.envs > 1:
             raise ConfigError("--episode: shows one environment, so --envs cannot be more")
-        if options.episode is None and (options.goals == "grid" or "trainer.eval_episodes" in overrides):
+        if options.episode is None and (options.goals != "test" or "trainer.eval_episodes" in overrides):
             raise ConfigError("--goals and --episodes: need --episode K, they say of which evaluation")
         task, others = _split_task(overrides)
         config = load_to_act(options.run, others)
@@ -126,7 +129,7 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
             run_dir=options.run,
             checkpoint=options.checkpoint or "last",
             agent=options.seed,
-            exam=exams.Exam(grid=_grid(options), seed=options.evaluation_seed, task=task),
+            exam=exams.Exam(**_goals(options), seed=options.evaluation_seed, task=task),
             episode=options.episode,
             quiet=options.quiet,
         )

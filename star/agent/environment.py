@@ -18,15 +18,18 @@ from star.config.section import ConfigError
 
 
 def make(config: Config, goals: str, **others: Any) -> Any:
-    """The task of `config`: on its test goals with "test", as for training with "train"; `others` are options too.
+    """The task of `config`: for training with "train", for tests with "test"; `others` are options too.
+
+    With "trained" it is that of tests with the goals of training.
 
     Raises:
       UserError: in one line, if it cannot be had.
     """
+    training = {"goals": "train"} | config.env.options | config.env.training
     if goals == "train":
-        options = {"goals": goals} | config.env.options | config.env.training | others
+        options = training | others
     else:
-        options = config.env.options | {"goals": goals} | others
+        options = config.env.options | {"goals": training["goals"] if goals == "trained" else goals} | others
     name, engine = config.env.name, config.env.engine
     try:
         if not plugins.is_plugin(name):

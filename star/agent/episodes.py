@@ -84,6 +84,15 @@ def summarise_way(trials: Trials, shortest: np.ndarray | None, *, dt: float, len
     }
 
 
+def success_behind(episode: Episode, behind: np.ndarray | None) -> dict[str, Any]:
+    """`success_behind_walls`: success_any of the episodes `behind` (bool), and how many these are; None without any."""
+    chosen = np.asarray(episode.success_any, np.float64)[behind] if behind is not None else np.empty(0)
+    return {
+        "episodes_behind_walls": len(chosen),
+        "success_behind_walls": float(chosen.mean()) if len(chosen) else None,
+    }
+
+
 def weighted_success(reached: np.ndarray, path: np.ndarray, shortest: np.ndarray) -> np.ndarray:
     """Success weighted by path length (Anderson et al. 2018) of every episode that has a shortest way at all.
 

@@ -110,8 +110,8 @@ def improvements(found: Sequence[Row]) -> Table:
 
 
 def _title(rows: Sequence[Row]) -> str:
-    side = rows[0]["goals"].removeprefix("grid ")
-    goals = "test goals" if rows[0]["goals"] == "test" else f"goals on a grid of {side} x {side}"
+    kind, _, side = rows[0]["goals"].partition(" ")
+    goals = f"goals on a grid of {side} x {side}" if side else {"test": "test goals", "train": "training goals"}[kind]
     tasks = dict.fromkeys(f"{row['env']} ({row['engine']})" for row in rows)
     return f"{', '.join(tasks)}: {goals}, 95 % intervals"
 

@@ -23,7 +23,7 @@ from envs import goal_env, routes
 from envs.common import modes
 from envs.vector import VectorEnv
 from star.agent import environment
-from star.agent.episodes import MEASURES, Trials, summarise, summarise_way
+from star.agent.episodes import MEASURES, Trials, success_behind, summarise, summarise_way
 from star.agent.play import Episode, greedy
 from star.agent.sections import Config
 from star.config.loading import parse
@@ -41,19 +41,23 @@ FAILED = 10  # episodes that failed, named for each seed
 
 @dataclass(frozen=True)
 class Exam:
-    """What agents are to do: `grid` None means the test goals, N a grid of N x N; `seed` chooses starts and goals.
+    """What agents are to do: with `grid` N on a grid of N x N goals, else on those of tests, or of `training`.
 
-    `task` are dotted settings of the task, `env.name` and `env.options`, where they are not to be those of training.
+    `seed` chooses starts and goals. `task` are dotted settings of the task, `env.name` and `env.options`, where they
+    are not to be those of training.
     """
 
     grid: int | None = None
+    training: bool = False
     seed: int = 0
     task: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def goals(self) -> str:
         """The goals in words."""
-        return "test" if self.grid is None else f"grid {self.grid}"
+        if self.grid is not None:
+            return f"grid {self.grid}"
+        return "train" if self.training else "test"
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ def prepare(config: Config, exam: Exam, *, episodes: int, source: Path) -> Cours
     """
     program = programs.build(config)
     task = elsewhere(config, exam.task)
-    env = environment.make(task, "test")
+    env = environment.make(task, "trained" if exam.training else "test")
     spec = _fitting(program, env, source=source)
     goals = cells = None
     if exam.grid is not None:
@@ -261,26 +265,46 @@ def shortest_ways(course: Course, trials: Trials) -> np.ndarray | None:
     """
     if course.env.arena is None:
         return None
-    starts = np.asarray(trials.start)[..., _xy(course.spec.abstract_indices)].reshape(-1, 2)
-    goals = np.asarray(trials.goal)[..., _xy(course.spec.goal_indices)].reshape(-1, 2)
-    found = routes.distances(course.env.arena, starts, goals)
+    found = routes.distances(course.env.arena, *_ends(course, trials))
     if found is None:
         return None
     return np.maximum(found - course.spec.success_radius, 0.0).reshape(trials.path.shape)
 
 
+def behind_walls(course: Course, trials: Trials) -> np.ndarray | None:
+    """Episodes, like `trials.path`, in which a wall or a gap stands straight between the start and reach of the goal.
+
+    None where there is no map.
+    """
+    if course.env.arena is None:
+        return None
+    starts, goals = _ends(course, trials)
+    way = goals - starts
+    length = np.linalg.norm(way, axis=-1, keepdims=True)
+    left = np.maximum(1 - course.spec.success_radius / np.maximum(length, 1e-9), 0.0)
+    return routes.hidden(course.env.arena, starts, starts + left * way).reshape(trials.path.shape)
+
+
+def _ends(course: Course, trials: Trials) -> tuple[np.ndarray, np.ndarray]:
+    """Starts of all episodes, and their goals, both x and y [n, 2]."""
+    start = np.asarray(trials.start)[..., _xy(course.spec.abstract_indices)]
+    return start.reshape(-1, 2), np.asarray(trials.goal)[..., _xy(course.spec.goal_indices)].reshape(-1, 2)
+
+
 def _row(entry: _Entry, exam: Exam, trials: Trials, shortest: np.ndarray | None) -> dict[str, Any]:
     course, dt, length = entry.course, entry.course.env.dt, entry.course.env.episode_length
+    behind = behind_walls(course, trials)
 
-    def summary(trials: Trials, shortest: np.ndarray | None) -> dict[str, Any]:
-        return summarise(trials.episode) | summarise_way(trials, shortest, dt=dt, length=length)
+    def summary(trials: Trials, shortest: np.ndarray | None, behind: np.ndarray | None) -> dict[str, Any]:
+        found = summarise(trials.episode) | summarise_way(trials, shortest, dt=dt, length=length)
+        return found | success_behind(trials.episode, behind)
 
     per_seed = []
     for i, seed in enumerate(entry.program.seeds):
         one = jax.tree.map(lambda leaf, i=i: leaf[i], trials)
         failed = np.flatnonzero(one.episode.success_any == 0)[:FAILED].tolist()
-        own = None if shortest is None else shortest[i]
-        per_seed.append({"seed": seed} | summary(one, own) | {"failed": failed})
+        own = (None if found is None else found[i] for found in (shortest, behind))
+        per_seed.append({"seed": seed} | summary(one, *own) | {"failed": failed})
     row = {
         "run": str(entry.run_dir),
         "env": course.env.name,
@@ -290,7 +314,7 @@ def _row(entry: _Entry, exam: Exam, trials: Trials, shortest: np.ndarray | None)
         "goals": exam.goals,
         "film": goal_env.has(course.env, *goal_env.DRAWN),
     }
-    row |= summary(trials, shortest)
+    row |= summary(trials, shortest, behind)
     if len(per_seed) > 1:
         for measure in MEASURES:
             scores = [seed[measure] for seed in per_seed]

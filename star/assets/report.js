@@ -1,6 +1,6 @@
 "use strict";
 // Draws the report from the JSON in #data. All text of the runs goes in as text nodes, never as markup.
-const { made, runs, settings } = JSON.parse(document.getElementById("data").textContent);
+const { made, runs, settings, watched } = JSON.parse(document.getElementById("data").textContent);
 // what the runs measure, each once, and what they count
 const measures = [...new Map(runs.flatMap(run => run.measures).map(one => [one.key, one])).values()];
 const unit = runs.every(run => run.unit === runs[0].unit) ? runs[0].unit : "steps";
@@ -196,7 +196,8 @@ function opening() {
   document.title = `${runs.length === 1 ? runs[0].name : plural(runs.length, "run")} · STAR report`;
   page.append(html("header", {},
     html("h1", {}, runs.length > 3 ? plural(runs.length, "run") : runs.map(run => run.name).join(", ")),
-    html("p", { class: "soft" }, `${tasks} · ${plural(runs.length, "run")} · ${made.date}`)));
+    html("p", { class: "soft" }, `${tasks} · ${plural(runs.length, "run")} · ${made.date}`,
+      watched ? html("span", {}, " · ", html("b", { id: "live" }, "training, renewed as it goes")) : null)));
   const rows = runs.map(({ name, seeds, facts }, slot) => {
     const done = facts.env_steps >= facts.total_env_steps;
     return [
@@ -594,3 +595,41 @@ function provenance() {
 }
 
 for (const draw of [opening, evaluations, abstraction, strategies, throughput, levels, films, configurations, provenance]) draw();
+if (watched) watch();
+
+// The page of `star watch` loads itself again when the run has written more, with what was chosen on it.
+function watch() {
+  const controls = () => [...document.querySelectorAll("input, select, details")].map(node => [
+    [node.tagName, node.id, node.ariaLabel, node.name, node.type === "radio" && node.value, node.firstChild?.textContent].join(), node]);
+  const chosen = node => {
+    if (node.tagName === "DETAILS") return node.open;
+    if (node.type === "range") return node.value === node.max ? "latest" : node.value;
+    return ["radio", "checkbox"].includes(node.type) ? node.checked : node.value;
+  };
+  const choose = (node, value) => {
+    if (node.tagName === "DETAILS") node.open = value;
+    else if (["radio", "checkbox"].includes(node.type)) value && node.click();
+    else {
+      node.value = value;
+      node.dispatchEvent(new Event(node.type === "range" ? "input" : "change"));
+    }
+  };
+  const before = JSON.parse(sessionStorage.getItem("chosen") || "{}");
+  for (const [name, node] of controls()) {
+    if (name in before && before[name] !== chosen(node)) choose(node, before[name]);
+  }
+  history.scrollRestoration = "manual";
+  document.documentElement.style.overflowAnchor = "none";
+  setTimeout(() => scrollTo(0, sessionStorage.getItem("scroll") || 0), 100);  // once all charts have their height
+  const changes = new EventSource(`changes?of=${watched}`);
+  changes.onmessage = () => {
+    changes.close();
+    sessionStorage.setItem("chosen", JSON.stringify(Object.fromEntries(controls().map(([name, node]) => [name, chosen(node)]))));
+    sessionStorage.setItem("scroll", scrollY);
+    location.reload();
+  };
+  changes.onerror = () => {
+    changes.close();
+    document.getElementById("live").textContent = "no longer renewed";
+  };
+}

@@ -16,7 +16,21 @@ from typing import Any, NoReturn
 from envs.common import modes, plugins
 from envs.common.errors import Notice, UserError
 from star import __version__
-from star.cli import completion, configs, envs, evaluate, ls, record, render, report, settings, sweep, train, tutor
+from star.cli import (
+    completion,
+    configs,
+    envs,
+    evaluate,
+    ls,
+    record,
+    render,
+    report,
+    settings,
+    sweep,
+    train,
+    tutor,
+    watch,
+)
 from star.cli.streams import unbroken
 from star.cli.words import split_settings, value
 from star.config.section import ConfigError
@@ -30,6 +44,7 @@ COMMANDS: Mapping[str, ModuleType] = {
     "render": render,
     "record": record,
     "report": report,
+    "watch": watch,
     "tutor": tutor,
     "configs": configs,
     "envs": envs,
@@ -38,7 +53,7 @@ COMMANDS: Mapping[str, ModuleType] = {
 }
 """Each has `HELP`, `DESCRIPTION`, `add(parser)` and `run(options, overrides)`, which returns the exit code."""
 
-_WITHOUT_SETTINGS = ("ls", "report", "configs", "envs", "settings", "completion")
+_WITHOUT_SETTINGS = ("ls", "report", "watch", "configs", "envs", "settings", "completion")
 
 _HELP = """\
 Train a three-level agent (Commander, Tutor, Controller) whose goal regions refine themselves.
@@ -56,6 +71,7 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star render --run runs/NAME --out film.html   an episode of a trained agent
   star record runs/NAME --out demos.npz         what a trained agent can show another
   star report runs/A runs/B --out report.html   curves, regions and settings of runs, as one page
+  star watch runs/NAME                          the same page in the browser, while the run trains
   star tutor discover scores.csv skills.csv     prerequisites of skills, found from scores of students
   star configs                                  the configs that come with STAR
   star envs                                     the tasks

@@ -16,9 +16,9 @@ from star.config.section import ConfigError
 
 HELP = "success of trained agents"
 DESCRIPTION = """\
-Greedy episodes of trained agents on test goals, or on a grid of goals: success, time and way to the goal, with 95 %
-intervals; of several runs also how they compare. With --env.name or --env.options.KEY they act in another task than
-that of their training. With --goals grid, JSON and figures go to RUN/evaluation unless --out is given."""
+Greedy episodes of trained agents on test goals, training goals or a grid of goals: success, time and way to the goal,
+with 95 % intervals; of several runs also how they compare. With --env.name or --env.options.KEY they act in another
+task than that of their training. With --goals grid, JSON and figures go to RUN/evaluation unless --out is given."""
 _OF_ITS_OWN: dict[str, Any] = {
     "goals": "test",
     "grid": None,
@@ -55,7 +55,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 def add_goals(command: argparse.ArgumentParser) -> None:
     """Which goals: `render` shows episodes of such evaluations."""
     command.add_argument(
-        "--goals", choices=("test", "grid"), default="test", help="of the task (default), or a grid over the maze"
+        "--goals",
+        choices=("test", "train", "grid"),
+        default="test",
+        help="those of tests (default), those of training, or a grid over the maze",
     )
     command.add_argument("--grid", type=count(64), metavar="N", help="the grid has N x N cells (default: 8)")
 

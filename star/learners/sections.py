@@ -105,9 +105,11 @@ class TD3Config(BufferedConfig, LearnerConfig):
     replays: ClassVar[bool] = True
 
     def check(self, rollout: Rollout) -> None:
-        """A rollout fits into the buffer, which is cut into equal shares for devices."""
+        """The buffer holds a rollout, and what updates wait for; it is cut into equal shares for devices."""
         if self.buffer_size < rollout.size:
             raise ValueError(f"buffer_size: {self.buffer_size} is below one rollout of {rollout.size}")
+        if self.buffer_size < self.min_transitions:
+            raise ValueError(f"min_transitions: {self.min_transitions} exceeds buffer_size {self.buffer_size}")
         if self.buffer_size % rollout.devices:
             raise ValueError(
                 f"buffer_size: {self.buffer_size} cannot be shared evenly by trainer.devices {rollout.devices}"

@@ -158,7 +158,7 @@ def _one_update(
         next_obs=state.normalizer(batch.next_obs),
         reward=batch.reward / unit(config, state.rewards),
     )
-    ready = replay.filled(state.ring) >= min(config.min_transitions, replay.capacity(state.ring))
+    ready = replay.filled(state.ring) >= config.min_transitions
     act_too = ready & (state.updates % config.policy_delay == 0)
 
     critic_grad, critic_metrics = jax.grad(partial(_critic_loss, config), has_aux=True)(

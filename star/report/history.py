@@ -37,6 +37,10 @@ _PROVENANCE: Kinds = {
 _TOTAL = "trainer.total_env_steps"
 
 
+class NothingYet(ConfigError):
+    """A run without a complete epoch."""
+
+
 @dataclass(frozen=True)
 class Run:
     """What a run, or several `together`, left on disk.
@@ -77,7 +81,7 @@ def read(run_dir: Path, config: RunConfig, *, name: str) -> Run:
     seeds = config.trainer.num_seeds
     epochs = _complete(_checked(journal.metrics, _METRICS), seeds)
     if not epochs:
-        raise ConfigError(f"{run_dir}: its metrics.jsonl holds no complete epoch, so there is nothing to show yet")
+        raise NothingYet(f"{run_dir}: its metrics.jsonl holds no complete epoch, so there is nothing to show yet")
     starts = _checked(journal.provenance, _PROVENANCE)
     stretches = _stretches(starts, config, source=str(journal.provenance.path))
     return Run(

@@ -34,7 +34,7 @@ MAX_FILM = 1_500_000  # bytes of a film in the page
 
 _FILMS = (".mp4", ".gif", ".html")
 _MARK = '<meta name="generator" content="star report">'
-_SMALL_FILM = ("--every", "5", "--fps", "10", "--height", "240")  # about 1 MB for an episode of 500 env steps
+SMALL_FILM = ("--every", "5", "--fps", "10", "--height", "240")  # about 1 MB for an episode of 500 env steps
 
 
 def write(runs: Mapping[Path, RunConfig], out: Path, *, groups: Mapping[str, Sequence[Path]] | None = None) -> str:
@@ -195,7 +195,7 @@ def short(values: Any, *, digits: int = 4) -> list[float | None]:
 def film(run_dir: Path) -> dict[str, Any]:
     """The newest film in the figures of a run that is small enough, as text or base64, and how to make one."""
     out = str(run_dir / "figures" / "episode.html")
-    command = command_line.of("render", "--run", run_dir, "--out", out, *_SMALL_FILM)
+    command = command_line.of("render", "--run", run_dir, "--out", out, *SMALL_FILM)
     folder = run_dir / "figures"
     found = [path for path in folder.iterdir() if path.suffix in _FILMS] if folder.is_dir() else []
     newest = sorted(found, key=lambda path: path.stat().st_mtime, reverse=True)

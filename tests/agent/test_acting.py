@@ -21,7 +21,7 @@ from star.agent.slim import slim
 from star.config.loading import load_to_act
 from star.training import checkpoint
 from star.training import program as programs
-from tests.small import RUN
+from tests.small import ALONE, RUN
 
 EPISODES, STEPS = 3, 40  # as in conftest.UNTRAINED
 GOAL = (4, 6)  # where the goal is in an observation
@@ -210,7 +210,7 @@ def test_no_run_is_told_in_one_line(tmp_path):
 
 def test_training_and_evaluating_return_what_the_commands_print(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    result = star.train(RUN, {"trainer.total_env_steps": 480})
+    result = star.train(ALONE, {"trainer.total_env_steps": 480})
     measure = "success_final"
     assert result.keys() == {"run", "env_steps", measure, "interrupted", "fault"}
     assert (result["env_steps"], result["interrupted"], result["fault"]) == (480, False, None)

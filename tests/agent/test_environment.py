@@ -37,7 +37,6 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "run.yaml").write_text(json.dumps(settings))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.setenv("STAR_IMPORT", "")
     forget(monkeypatch)
     yield tmp_path
     forget(monkeypatch)

@@ -367,6 +367,7 @@ def test_a_batch_larger_than_its_buffer_is_refused_in_one_line(breaking_env, tin
 
 
 ADJACENCY = {"enabled": True, "hidden": [8], "batch_size": 8, "updates_per_epoch": 2}
+REPLAY = {"hidden": [8], "batch_size": 16, "buffer_size": 64, "min_transitions": 32, "updates_per_rollout": 2}
 
 
 @pytest.fixture(scope="module")
@@ -378,8 +379,9 @@ def gara(breaking_env, tiny):
 
 @pytest.fixture(scope="module")
 def hrac(breaking_env, turning, tiny):
-    """HIRO with a loss more, here with subgoals that set a heading, of which adjacency knows nothing."""
-    values = loading.parse(tiny, {"commander.enabled": False, "tutor.adjacency": ADJACENCY})
+    """HIRO, which replays and corrects old subgoals, with a loss more; its subgoals set a heading too."""
+    replaying = {"tutor.learner": "td3", "tutor.off_policy_correction": True, "tutor.td3": REPLAY}
+    values = loading.parse(tiny, {"commander.enabled": False, "tutor.adjacency": ADJACENCY} | replaying)
     return Epoch(breaking_env, values.model_dump(mode="json"), turning)
 
 
@@ -389,9 +391,12 @@ def test_levels_can_be_left_out(request, name):
     agent = request.getfixturevalue(name)
     start = agent.init(jax.random.key(0))
     end, metrics = agent.one(agent.config.hyper(), start)
-    moved = jax.tree.map(lambda a, b: bool((a != b).any()), start.controller.params, end.controller.params)
-    assert any(jax.tree.leaves(moved))
-    assert (end.tutor is None) == ("tutor/kl" not in metrics) == (name == "gara")
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), start, end)
+    assert any(jax.tree.leaves(moved.controller.params))
+    assert (end.tutor is None) == ("tutor/q" not in metrics) == (name == "gara")
+    if name == "hrac":
+        assert int(end.tutor.updates) == 2 * (agent.spec.episode_length // (2 * L) - 1)  # not of the first 16 decisions
+        assert all(any(jax.tree.leaves(moved.tutor.params[part])) for part in ("actor", "critic"))
     assert ("abstraction/regions" in metrics) == (name == "gara")
     assert bool(end.commander.chosen.any()) == (name == "gara")
     assert (end.adjacency is not None and bool(end.adjacency.adjacent.any())) == (name == "hrac")

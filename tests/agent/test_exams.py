@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import envs
 from star import cli
-from star.agent import exam_results, exam_tables, exams, films
+from star.agent import episodes, exam_results, exam_tables, exams, films
 from star.agent.exams import Exam, Target
 from star.agent.play import Episode
 from star.config import loading
@@ -138,6 +139,28 @@ def test_the_shortest_way_ends_where_the_goal_counts_as_reached(run):
     trials = exams.measure(Episode.start(2), jnp.zeros((2, 2, 2)), jnp.zeros((2, 2)), goal=jnp.zeros((2, 2)))
     trials = trials.replace(goal=np.array([[0.0, 16.0], [3.0, 0.0]]))
     np.testing.assert_allclose(exams.shortest_ways(course, trials), [2 * np.hypot(12, 4) + 8 - 5, 0.0])
+
+
+def test_a_goal_is_behind_a_wall_unless_who_goes_straight_on_comes_within_its_reach(run):
+    course = exams.prepare(config_of(run), Exam(), episodes=1, source=run)
+    goals = np.array([[0.0, 16.0], [3.0, 0.0], [0.0, 8.9], [0.0, 9.1], [16.0, 0.0]])
+    trials = exams.measure(Episode.start(5), jnp.zeros((2, 5, 2)), jnp.zeros((2, 5)), goal=jnp.asarray(goals))
+    behind = exams.behind_walls(course, trials)
+    assert behind.tolist() == [True, False, False, True, False]  # the wall begins at y = 4, success 5 m before a goal
+    reached = trials.episode.replace(success_any=np.array([1.0, 1.0, 0.0, 0.0, 0.0]))
+    told = {"episodes_behind_walls": 2, "success_behind_walls": 0.5}
+    assert episodes.success_behind(reached, behind) == told
+    assert set(episodes.success_behind(reached, None).values()) == {0, None}
+
+
+def test_training_goals_are_those_that_training_draws_by_the_rules_of_tests(run):
+    training = {"env.training": {"goals": "free", "position_noise": 0.5}}
+    config = loading.load(run / "config.yaml", training)
+    env = exams.prepare(config, Exam(training=True), episodes=1, source=run).env
+    usual = envs.make("point_maze", goals="free")
+    drawn = (jax.vmap(one.draw_goal)(jax.random.split(jax.random.key(0), 50)) for one in (env, usual))
+    np.testing.assert_array_equal(*drawn)
+    assert env._position_noise == 0.0 and Exam(training=True).goals == "train"
 
 
 def test_in_another_task_an_agent_keeps_its_regions_and_meets_other_goals_and_clocks(run):

@@ -12,7 +12,7 @@ import pytest
 from star.agent import commands as star_commands
 from star.agent import demonstrations, exam_results, exam_tables, exams, films
 from star.cli import command, main
-from star.report import page
+from star.report import page, watching
 from star.sweeps import work
 from star.training import trainer
 from star.tutoring import discover
@@ -120,6 +120,7 @@ PRINTING = {
     "render": "render point_maze --out new.png",
     "record": "record runs/old --out new.npz",
     "report": "report runs/old --out new.html",
+    "watch": "watch runs/old",
     "tutor": "tutor discover scores.csv skills.csv",
     "configs": "configs",
     "envs": "envs",
@@ -143,6 +144,7 @@ def test_output_that_nobody_reads_is_no_error(words, monkeypatch, capsys):
     monkeypatch.setattr(discover, "discover", lambda options, overrides: print("found") or 0)
     for module, name in ((films, "render"), (demonstrations, "record"), (page, "write")):
         monkeypatch.setattr(module, name, lambda *_, **__: "written")
+    monkeypatch.setattr(watching, "serve", lambda *_, say, **__: say("served"))
     reading, writing = os.pipe()
     os.close(reading)
     with monkeypatch.context() as patch, os.fdopen(writing, "w") as nowhere:

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError
 from envs.common.errors import UserError
 from star.agent.sections import Config
 from star.config import described, kinds, loading
-from star.config.loading import fields, load, parse
+from star.config.loading import changed, dotted, fields, load, parse
 from star.config.section import Section, setting
 
 DEFAULTS = {key: default for key, default, _ in fields(Config)}
@@ -492,6 +492,33 @@ def test_every_shipped_layer_fits_every_shipped_config(pytestconfig, folder):
         }.get(layer.stem, lambda config: True)
         assert same == [file.stem for file in files if not there(load(file))]
         assert len(same) < len(files)
+
+
+@pytest.mark.parametrize("agent", ["agents/frugal", "agents/hiro"])
+def test_the_same_layer_makes_the_tutor_of_star_and_of_hiro_learn_off_policy(agent):
+    """Nothing else differs, so that a comparison is about the learner."""
+    without, replaying = (load("ant_maze", layers=layers) for layers in ([agent], [agent, "ablations/td3_tutor"]))
+    other = changed(dotted(without), dotted(replaying))
+    levels = {key for key in other if not key.startswith("tutor.td3.")}
+    assert levels == {"tutor.learner", "tutor.off_policy_correction", "tutor.unroll"}
+    assert replaying.tutor.td3.discount == without.tutor.ppo.discount
+    assert replaying.controller.learner == "ppo" and replaying.tutor.td3.hidden == without.tutor.ppo.hidden
+
+
+@pytest.mark.parametrize("learner", ["ppo", "td3"])
+def test_each_new_transition_may_be_learnt_from_as_often_as_published(learner):
+    """128 times, at the Tutor above either learner and at the Controller; as docs/baselines.md says it is asked for."""
+    asked = {"tutor.td3.updates_per_rollout": 128, "controller.learner": learner}
+    asked |= {"controller.td3.batch_size": 4096, "controller.td3.updates_per_rollout": 160}
+    config = load("ant_maze", asked, layers=["agents/hiro", "ablations/td3_tutor"])
+    said = {name: level.settings.samples_per_transition(size) for name, level, size in config.learners()}
+    assert said == {"tutor": 128, "controller": None if learner == "ppo" else 128}
+
+
+@pytest.mark.parametrize("layers", [[], ["paper/many"]])
+def test_the_papers_configs_learn_from_each_transition_as_often_as_published(layers):
+    learners = load("paper/ant_maze", layers=layers).learners()
+    assert [level.settings.samples_per_transition(size) for _, level, size in learners] == [128, 128]
 
 
 def test_a_number_that_float32_cannot_hold_is_refused():

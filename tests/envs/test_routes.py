@@ -9,7 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from envs.arena import CHASM, FREE, GOAL, ROBOT, WALL, Arena
-from envs.routes import distances, routes
+from envs.routes import distances, hidden, routes
 from envs.tasks import TASKS, Switch
 
 EVERYWHERE = FREE + ROBOT + GOAL
@@ -184,12 +184,14 @@ def test_distances_are_those_of_the_shortest_ways_by_way_of_any_corners_of_cells
     corners = np.array([(c - column - 0.5, r - row - 0.5) for r in range(1, 5) for c in range(1, 6)])
     points = np.concatenate([centres, corners])
     lengths = np.linalg.norm(points[:, None] - points, axis=-1)
-    shortest = np.where(seen(arena, points, points), lengths, np.inf)
+    sight = seen(arena, points, points)
+    shortest = np.where(sight, lengths, np.inf)
     for by in range(len(centres), len(points)):
         shortest = np.minimum(shortest, shortest[:, by, None] + shortest[by])
     pairs = np.array(list(itertools.product(range(len(centres)), repeat=2)))
-    found = distances(arena, *(centres[pairs[:, i]] for i in (0, 1)))
-    np.testing.assert_allclose(found, shortest[pairs[:, 0], pairs[:, 1]], atol=1e-4)
+    ends = [centres[pairs[:, i]] for i in (0, 1)]
+    np.testing.assert_allclose(distances(arena, *ends), shortest[pairs[:, 0], pairs[:, 1]], atol=1e-4)
+    np.testing.assert_array_equal(hidden(arena, *ends), ~sight[pairs[:, 0], pairs[:, 1]])
 
 
 def test_no_way_leads_between_two_walls_that_touch_with_their_corners():

@@ -27,8 +27,6 @@ def here(tmp_path, monkeypatch):
     (tmp_path / "run.yaml").write_text(json.dumps(ALONE))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.delenv("STAR_IMPORT", raising=False)
-    monkeypatch.setenv("STAR_IMPORT", "")  # noted, so that what a command adds to it goes again
     monkeypatch.delitem(sys.modules, "mine", raising=False)
     yield tmp_path
     sys.modules.pop("mine", None)

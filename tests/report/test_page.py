@@ -14,61 +14,7 @@ from star.agent.kind import STAR
 from star.cli import main
 from star.config.loading import load, load_run, parse
 from star.report import history, page
-
-CUTS = [0.0, 8.0, 12.0, 16.0]
-
-
-def lines(path, rows):
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows), encoding="utf-8")
-
-
-def metrics(epochs, seeds, *, every=2, success=lambda seed, epoch: 0.5, **others):
-    """Rows of an epoch of 100 env steps and 2 s each."""
-    rows = []
-    for epoch in range(1, epochs + 1):
-        for seed in seeds:
-            row = {"seed": seed, "controller/actor_loss": seed + epoch, "abstraction/regions": 2}
-            if epoch % every == 0:
-                row |= {f"eval/{name}": success(seed, epoch) for name in ("success_any", "success_final", "distance")}
-            rows.append(row | others | {"env_steps": 100 * epoch, "wall_s": 2.0 * epoch, "env_steps_per_s": 50 + epoch})
-    return rows
-
-
-def strip(number, *, old=False):
-    """Regions from the left to the right wall of the Point Maze, cut at the first `number` of CUTS along y."""
-    edges = [-4.0, *CUTS[:number], 20.0]
-    count = len(edges) - 1
-    row = {
-        "lower": [[-4.0, edge] for edge in edges[:-1]],
-        "upper": [[20.0, edge] for edge in edges[1:]],
-        "chosen": [float(i + 1) for i in range(count)],
-    }
-    known = {"value": [i / count for i in range(count)], "target": [min(i + 1, count - 1) for i in range(count)]}
-    edges = {"reaches": [[i, i + 1] for i in range(count - 1)], "misses": [], "goal": [0.0, 16.0]}
-    return row if old else row | known | edges
-
-
-@pytest.fixture
-def make(tmp_path):
-    """Writes a run directory; four epochs, two evaluations and two seeds if not told otherwise.
-
-    `resumed` has (env steps, what else its line of provenance says) of each time that the run went on.
-    """
-
-    def write(name="run", *, seeds=(0, 1), rows=None, regions=None, settings=None, resumed=()):
-        folder = tmp_path / name
-        folder.mkdir(parents=True)
-        config = parse({"trainer": {"num_seeds": len(seeds), "total_env_steps": 400}}, settings)
-        (folder / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
-        lines(folder / "metrics.jsonl", metrics(4, seeds) if rows is None else rows)
-        grown = [{"seed": seed, "env_steps": 100 * n} | strip(n // 2) for n in (2, 4) for seed in seeds]
-        lines(folder / "regions.jsonl", grown if regions is None else regions)
-        start = {"time": "2026-01-02T03:04:05+00:00", "commit": "c0ffee", "device": "abacus", "python": "3.11.0"}
-        start |= {"versions": {"jax": "0.10"}}
-        lines(folder / "provenance.jsonl", [{"env_steps": n} | start | more for n, more in [(0, {}), *resumed]])
-        return folder
-
-    return write
+from tests.report.by_hand import metrics, strip
 
 
 def grown(run, most=page.MAX_BOXES):

@@ -338,7 +338,8 @@ def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
 @pytest.mark.parametrize("learner", [ppo, td3])
 def test_the_actor_comes_near_to_demonstrated_actions(learner):
     name = learner.__name__.rsplit(".", 1)[-1]
-    small = {"hidden": [16], "batch_size": 8, "buffer_size": 64, "policy_delay": 1, "actor_learning_rate": 1e-2}
+    small = {"hidden": [16], "batch_size": 8, "buffer_size": 64, "min_transitions": 64}
+    small |= {"policy_delay": 1, "actor_learning_rate": 1e-2}
     values = {"hidden": [16], "passes": 1, "minibatches": 1, "learning_rate": 1e-3} if learner is ppo else small
     alone = {"tutor": {"enabled": False}}
     parsed = loading.parse({"controller": {"learner": name, name: values}, "trainer": {"num_envs": 4}, **alone})

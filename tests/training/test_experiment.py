@@ -111,7 +111,7 @@ def test_what_whole_epochs_make_of_the_env_steps_is_said_and_that_nothing_is_lef
 
 
 def test_what_to_type_next_lets_its_module_in_and_can_be_pasted(here, capsys, monkeypatch):
-    monkeypatch.setenv("STAR_IMPORT", "")  # noted, so that what a command adds to it goes again
+    monkeypatch.setenv("STAR_IMPORT", "")
     assert main(["train", "run.yaml", "--run-dir", "a run", "--quiet", "--import", "bandit"]) == 0
     told = capsys.readouterr().out.splitlines()[-1]
     assert told == "next:    star evaluate 'a run' --import bandit"
