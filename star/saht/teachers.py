@@ -85,7 +85,7 @@ def expanded(teachers: Sequence[TeacherConfig], world: World) -> tuple[TeacherCo
 
 def shown_by(teachers: Sequence[TeacherConfig], world: World, scale: Scale) -> Shown:
     """What they show, scaled; raises `UserError` in one line if a file is not what it should be."""
-    all_shown = [_demonstrations(teacher, number, world, scale) for number, teacher in enumerate(teachers)]
+    all_shown = [_demonstrations(teacher, world, scale) for teacher in teachers]
     most = max((len(demos.lengths) for demos in all_shown), default=1)
 
     def stacked(leaves: Sequence[np.ndarray]) -> Array:
@@ -100,11 +100,11 @@ def shown_by(teachers: Sequence[TeacherConfig], world: World, scale: Scale) -> S
     return Shown(sequences, lengths, outcomes, counts)
 
 
-def _demonstrations(teacher: TeacherConfig, number: int, world: World, scale: Scale) -> Demonstrations:
+def _demonstrations(teacher: TeacherConfig, world: World, scale: Scale) -> Demonstrations:
     if teacher.kind == "procedure":
         return _nothing(world)
     if teacher.source == "world":
-        demos = demonstrated(world, world.index(teacher.task or 0), teacher.demos, scale, seed=number)
+        demos = demonstrated(world, world.index(teacher.task or 0), teacher.demos, scale)
     else:
         demos = load(Path(teacher.source), world, teacher.task or "", sha256=teacher.sha256)
     if teacher.flaw == "repetitive":
@@ -120,13 +120,13 @@ def _nothing(world: World) -> Demonstrations:
     )
 
 
-def demonstrated(world: World, task: int, count: int, scale: Scale, *, seed: int) -> Demonstrations:
+def demonstrated(world: World, task: int, count: int, scale: Scale) -> Demonstrations:
     """What the world's own teacher shows: goals drawn evenly, of which those count that he reaches, without noise.
 
     Raises:
       UserError: in one line, if he reaches too few.
     """
-    key = modes.key(seed)
+    key = modes.key(task)
     lower, upper = jnp.asarray(world.lower)[task], jnp.asarray(world.upper)[task]
     goals = jax.random.uniform(key, (TRIES * count, 4), minval=lower, maxval=upper)
     sequences, lengths = world.demonstrate(task, goals)
