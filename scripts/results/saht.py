@@ -11,6 +11,7 @@ interrupted goes on, so empty `--runs` when code or configs have changed. Into `
     WORLD.md      the table of errors, and that of the claims: 95 % bootstrap intervals over seeds
     WORLD.png     error over iterations by algorithm, for each task and for their mean
 
+and with `--docs` the pictures of docs/saht.md into docs/images: that one, and two figures of SGIM-PB's run.
 A claim that something is better holds if the interval of the difference lies on that side of 0; one that names a
 number, if the mean does. With `--noise` the files are called WORLD_noise.
 """
@@ -29,11 +30,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from envs import worlds
+from star.config.loading import load_run
 from star.report.statistics import stratified
-from star.saht.figures import colour
+from star.saht.experiment import Saht
+from star.saht.figures import colour, plain_ticks
 from star.training.journal import Journal, by_step
 
 ROOT = Path(__file__).parents[2]
+IMAGES = ROOT / "docs" / "images"
 STAR = (sys.executable, "-m", "star")
 TOTAL = {"pen": 25_000, "throw": 5_000}
 
@@ -86,15 +91,27 @@ class Claim(NamedTuple):
 
 def trained(world: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
     """What a run of the algorithm has measured; it is made, or gone on with, if need be."""
-    run = options.runs / f"{world}{'_noise' if options.noise else ''}" / name
+    run = options.runs / _stem(world, options.noise) / name
     words = [*ALGORITHMS[name], "--world.name", world, "--seeds", str(options.seeds)]
     words += ["--total-env-steps", str(options.total)]
     words += ["--world.noise", str(options.noise)] if options.noise else []
-    if (run / "config.yaml").exists():
+    if _done(run, options.total):
+        pass
+    elif (run / "config.yaml").exists():
         subprocess.run([*STAR, "train", "--resume", str(run), "--quiet"], cwd=ROOT, check=True)
     else:
         subprocess.run([*STAR, "train", *words, "--run-dir", str(run), "--quiet"], cwd=ROOT, check=True)
     return {"command": shlex.join(["star", "train", *words])} | read(run)
+
+
+def _stem(world: str, noise: float) -> str:
+    return world + "_noise" * (noise > 0)
+
+
+def _done(run: Path, total: int) -> bool:
+    """Whether the run has been trained, and was evaluated at its end."""
+    rows = Journal.of(run, tables="practice").metrics.read()
+    return bool(rows) and rows[-1]["env_steps"] >= total and "eval/error" in rows[-1]
 
 
 def read(run: Path) -> dict[str, Any]:
@@ -103,9 +120,9 @@ def read(run: Path) -> dict[str, Any]:
     rows, tables, starts = journal.metrics.read(), journal.tables.read(), journal.provenance.read()
     epochs = by_step(rows)
     evaluated = [now for now in epochs if "eval/error" in now[0]]
-    names = [key.removeprefix("saht/task_") for key in rows[0] if key.startswith("saht/task_")]
-    ways = [key.removeprefix("saht/strategy_") for key in rows[0] if key.startswith("saht/strategy_")]
-    taught = [way for way in ways if way.partition("_")[0] in ("action", "outcome", "procedure")]
+    config = load_run(run, {})
+    section, names = config.saht, worlds.make(config.world.name).names
+    taught = [teacher.name for teacher in section.teachers]
     tenths = [list(part) for part in np.array_split(np.arange(len(epochs)), 10)]
 
     def by_tenth(keys: Sequence[str]) -> list[list[float]]:
@@ -128,7 +145,7 @@ def read(run: Path) -> dict[str, Any]:
         "executed": [[round(row["eval/executed"], 5) for row in now] for now in evaluated if "eval/executed" in now[0]],
         "tasks": {name: by_tenth([f"saht/task_{name}"]) for name in names},
         "requests": by_tenth([f"saht/strategy_{way}" for way in taught]),
-        "ways": ways,
+        "ways": [*section.strategies, *taught],
         "chosen": [row["chosen"] for row in last],
         "played": [row["played"] for row in last],
     }
@@ -305,6 +322,7 @@ def draw(found: Mapping[str, Any], path: Path) -> None:
             style = ("-", "--", ":")[number // 10]
             axes.plot(np.asarray(one["steps"]) / 1000, mean, style, color=colour(number), lw=1.4, label=name)
         axes.set(title="mean of the tasks" if task == "mean" else task.replace("_", " "), yscale="log")
+        plain_ticks(axes)
         axes.grid(alpha=0.3, which="both")
         axes.tick_params(labelsize=7, which="both")
     for axes in panels[len(tasks) :]:
@@ -313,6 +331,14 @@ def draw(found: Mapping[str, Any], path: Path) -> None:
     figure.supylabel("error", size=9)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", fontsize="small")
     figure.savefig(path, dpi=80)
+
+
+def pictures(run: Path) -> None:
+    """Two figures of a run, for docs/saht.md."""
+    config, journal = load_run(run, {}), Journal.of(run, tables="practice")
+    drawn = Saht(config).figures(journal.metrics.read(), journal.tables.read())
+    for name in ("curriculum", "hierarchy"):
+        drawn[name].savefig(IMAGES / f"saht_{name}.png", dpi=80)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -327,6 +353,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--noise", type=float, default=0.0)
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "saht")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "saht")
+    parser.add_argument("--docs", action="store_true", help="draw the pictures of docs/saht.md")
     options = parser.parse_args(arguments)
     options.total = options.total or TOTAL[options.world]
     options.runs = options.runs.resolve()
@@ -335,7 +362,7 @@ def main(arguments: list[str] | None = None) -> None:
             raise SystemExit(f"error: {name}: no such algorithm; known are {', '.join(ALGORITHMS)}")
 
     options.out.mkdir(parents=True, exist_ok=True)
-    place = options.out / f"{options.world}{'_noise' if options.noise else ''}.json"
+    place = options.out / f"{_stem(options.world, options.noise)}.json"
     old = json.loads(place.read_text(encoding="utf-8"))["algorithms"] if place.exists() else {}
     for name in options.names or OF_WORLD[options.world]:
         old[name] = trained(options.world, name, options)
@@ -345,6 +372,10 @@ def main(arguments: list[str] | None = None) -> None:
         place.write_text(json.dumps(told | {"algorithms": found}) + "\n", encoding="utf-8")
         place.with_suffix(".md").write_text(table(found, claims), encoding="utf-8")
         draw(found, place.with_suffix(".png"))
+    if options.docs:
+        draw(found, IMAGES / f"saht_{place.stem}.png")
+        if "sgim_pb" in found:
+            pictures(options.runs / place.stem / "sgim_pb")
     print(place.with_suffix(".md").read_text(encoding="utf-8"))
 
 

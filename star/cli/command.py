@@ -56,7 +56,8 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star record runs/NAME --out demos.npz         what a trained agent can show another
   star report runs/A runs/B --out report.html   curves, regions and settings of runs, as one page
   star configs                                  the configs that come with STAR
-  star envs                                     the tasks
+  star train saht/sgim_pb                       learners of skills, who ask teachers
+  star envs                                     the tasks and worlds
   star settings [WORD]                          every setting: meaning, range, unit and default
   star completion bash                          completion with the Tab key
 """

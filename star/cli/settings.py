@@ -18,15 +18,21 @@ DESCRIPTION = "List settings: what each does, its type with range or choices, it
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Its arguments."""
-    parser.add_argument("word", nargs="?", default="", help="only settings with this in key or text, such as tutor")
-    parser.add_argument("--experiment", default=DEFAULT, metavar="NAME", help="star (default), or MODULE:NAME")
+    parser.add_argument(
+        "word",
+        nargs="?",
+        default="",
+        help="only settings with this in key or text, such as tutor; saht: all of SGIM-SAHT",
+    )
+    parser.add_argument("--experiment", default=DEFAULT, metavar="NAME", help="star (default), saht, or MODULE:NAME")
 
 
 def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     """Print the settings of a kind of experiment."""
     refuse_settings({key: value for key, value in overrides.items() if key != "experiment"})
-    model = kinds.find(options.experiment).Config
-    word = options.word.lower()
+    named = options.word in kinds.OURS and options.word != DEFAULT
+    model = kinds.find(options.word if named else options.experiment).Config
+    word = "" if named else options.word.lower()
     found = [one for one in settings(model) if word in one.key or word in one.line.lower()]
     if not found:
         keys = {part for one in settings(model) for part in (one.key, *one.key.split("."))}

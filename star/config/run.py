@@ -96,7 +96,7 @@ class TrainerConfig(Section):
 class RunConfig(Section):
     """What every experiment's settings have; it adds its own sections."""
 
-    experiment: str = setting("star", "This is what learns.", allowed="star, or module:name of your own")
+    experiment: str = setting("star", "This is what learns.", allowed="star, saht, or module:name of your own")
     trainer: TrainerConfig = TrainerConfig()
 
     @classmethod

@@ -38,7 +38,10 @@ def best(
 
 
 def errors(world: World, scale: Scale, memory: Memory, rows: Array | int, *, key: Array) -> dict[str, Any]:
-    """`error` and `area` of each task, and the mean error; with noise also `executed`, the error of the best rows anew."""
+    """`error` and `area` of each task, and the mean error.
+
+    With noise also `executed`: the mean error of the best rows when they are executed once more.
+    """
     found: dict[str, Any] = {}
     executed = []
     for task, name in enumerate(world.names):

@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import EngFormatter, MaxNLocator
+from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from envs.worlds import World
 from star.report.statistics import over_seeds
@@ -69,6 +69,7 @@ def summary(world: World, rows: Sequence[Row]) -> Figure:
         axes.fill_between(steps, np.maximum(low, 1e-3), high, color=shade, alpha=0.18, lw=0)
     _over_iterations(axes)
     axes.set(yscale="log", ylabel="error on goals of the evaluation")
+    plain_ticks(axes)
     axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize="small", ncols=2)
     return figure
@@ -167,6 +168,13 @@ def hierarchy(world: World, last: Sequence[Row]) -> Figure:
     figure.colorbar(panels[-1].images[0], ax=list(panels), label="share of procedures")
     figure.suptitle("tasks that procedures alone were made of; framed: as the world was designed", size=10)
     return figure
+
+
+def plain_ticks(axes: Axes) -> None:
+    """Numbers as they are on a logarithmic axis, those that begin with 1, 2 or 5."""
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def colour(task: int) -> str:

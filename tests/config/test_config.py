@@ -413,12 +413,15 @@ def test_a_number_at_the_edge_of_its_range_is_taken_and_one_beyond_it_refused(on
 
 def test_every_shipped_file_is_valid_and_names_a_task(pytestconfig):
     import envs
+    from envs import worlds
 
     configs = pytestconfig.rootpath / "configs"
     paths = sorted(set(configs.rglob("*.yaml")) - set(configs.glob("sweeps/*.yaml")))
     assert paths
     for path in paths:
-        assert load(path).env.name in envs.names()
+        config = load(path)
+        places = worlds.names() if config.experiment == "saht" else envs.names()
+        assert (config.world if config.experiment == "saht" else config.env).name in places
 
 
 def test_the_leaves_are_exactly_the_floats():

@@ -76,6 +76,16 @@ def test_a_run_learns_and_leaves_what_other_runs_do(capsys):
     assert '"unit":"iterations"' in page and page.count('"name":"hierarchy"') == 1
 
 
+def test_every_metric_is_explained_and_every_explained_metric_exists():
+    row = JsonLines(Path("whole/metrics.jsonl")).read()[-1]
+    ours = {key for key in row if key.startswith(("saht/", "eval/"))}
+    text = PAGE.with_name("saht.md").read_text(encoding="utf-8")
+    explained = set(re.findall(r"^\| `((?:saht|eval)/\w+)`", text, re.MULTILINE)) - {"eval/executed"}
+    names = {"TASK": ("place", "bell"), "NAME": ("actions", "procedures", "action_place", "procedure_bell")}
+    found = {key.replace(mark, name) for key in explained for mark in names if mark in key for name in names[mark]}
+    assert found | {key for key in explained if not key.endswith(tuple(names))} == ours
+
+
 def test_a_run_that_was_killed_goes_on_bit_for_bit():
     shutil.copytree("whole", "killed")
     for step in (150, 200):
