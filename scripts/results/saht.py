@@ -123,7 +123,8 @@ def read(run: Path) -> dict[str, Any]:
     config = load_run(run, {})
     section, names = config.saht, worlds.make(config.world.name).names
     taught = [teacher.name for teacher in section.teachers]
-    tenths = [list(part) for part in np.array_split(np.arange(len(epochs)), 10)]
+    n = len(epochs)
+    tenths = [slice(n * i // 10, max(n * (i + 1) // 10, n * i // 10 + 1)) for i in range(10)]
 
     def by_tenth(keys: Sequence[str]) -> list[list[float]]:
         """[tenths][seeds] of a sum of metrics."""

@@ -6,10 +6,12 @@ error of acting by the nearest neighbour.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from envs.worlds import World
@@ -37,20 +39,22 @@ def best(
     return jnp.where(scaled < FAR / 2, error, NEVER), scaled, row
 
 
-def errors(world: World, scale: Scale, memory: Memory, rows: Array | int, *, key: Array) -> dict[str, Any]:
-    """`error` and `area` of each task, and the mean error.
+def errors(
+    world: World, scale: Scale, goals: Sequence[np.ndarray], memory: Memory, rows: Array | int, *, key: Array
+) -> dict[str, Any]:
+    """`error` and `area` of each task, on its goals [n, 4], and the mean error.
 
     With noise also `executed`: the mean error of the best rows when they are executed once more.
     """
     found: dict[str, Any] = {}
     executed = []
     for task, name in enumerate(world.names):
-        goals = world.benchmark(task)
-        error, scaled, row = best(memory, rows, scale, task, goals)
+        wanted = jnp.asarray(goals[task])
+        error, scaled, row = best(memory, rows, scale, task, wanted)
         found |= {f"error_{name}": error.mean(), f"area_{name}": (scaled < CLOSE).mean()}
         if world.noise:
             again = world.execute(memory.sequences[row], memory.lengths[row], key=jax.random.fold_in(key, task))
-            apart = jnp.linalg.norm(again.value[:, task] - goals, axis=-1)
+            apart = jnp.linalg.norm(again.value[:, task] - wanted, axis=-1)
             executed.append(jnp.where(again.reached[:, task], apart, NEVER).mean())
     mean = sum(found[f"error_{name}"] for name in world.names) / len(world.names)
     return {"error": mean} | found | ({"executed": sum(executed) / len(executed)} if executed else {})

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from envs import worlds
-from envs.common.errors import UserError
+from envs.common.errors import UserError, where_raised
 from star.config.section import ConfigError
 from star.saht import choose, evaluation, loop, memory, teachers
 from star.saht.loop import SPLIT_EVERY, Seen, State
@@ -40,6 +40,8 @@ class Saht(Experiment):
         self.scale = memory.scale_of(self.world)
         self.steps_per_epoch = section.epoch
         self.ways = ways(self.config, self.world)
+        self.goals = goals(self.world)
+        """Those of the evaluation, of each task: made here, as a world may need a program of its own for them."""
 
     def resolve(self, config: Config) -> Config:
         """`config` with every teacher by himself, and as much memory as the run needs."""
@@ -143,8 +145,8 @@ class Saht(Experiment):
     def evaluate(self, hyper: Learner, state: State, keys: Array) -> dict[str, Array]:
         """Errors on the goals of the evaluation."""
         rows = state.epoch[0] * self.steps_per_epoch
-        one = lambda known, key: evaluation.errors(self.world, self.scale, known, rows, key=key)  # noqa: E731
-        return jax.vmap(one)(state.memory, keys)
+        errors = partial(evaluation.errors, self.world, self.scale, self.goals)
+        return jax.vmap(lambda known, key: errors(known, rows, key=key))(state.memory, keys)
 
     def rows(self, evaluated: Mapping[str, Any]) -> list[dict[str, Any]]:
         """The errors of each seed."""
@@ -189,3 +191,16 @@ def ways(config: Config, world: worlds.World) -> tuple[Way, ...]:
         for number, one in enumerate(config.saht.teachers)
     ]
     return (*alone, *asked)
+
+
+def goals(world: worlds.World) -> list[np.ndarray]:
+    """The goals of the evaluation of each task [n, 4]; raises `UserError` if they cannot be made, or are none."""
+    found = []
+    for number, name in enumerate(world.names):
+        try:
+            found.append(np.asarray(world.benchmark(number)))
+        except Exception as error:  # whatever the author of the world has done
+            raise ConfigError(f"world: {world.name}: goals of {name} raise {where_raised(error)}") from error
+        if found[-1].shape[1:] != (4,) or not len(found[-1]) or not np.isfinite(found[-1]).all():
+            raise ConfigError(f"world: {world.name}: goals of {name} are no finite numbers [n, {world.dims[number]}]")
+    return found

@@ -6,6 +6,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import yaml
@@ -113,6 +114,14 @@ def test_a_learner_alone_chooses_as_it_does_among_others_and_nothing_is_compiled
 def test_a_run_is_made_longer_as_far_as_its_memory_goes(capsys):
     assert main(["train", "--resume", "whole", "--total-env-steps", "450", "--quiet"]) == 2
     assert "trainer.total_env_steps: 450 is more than saht.memory 400" in capsys.readouterr().err
+
+
+def test_a_world_that_needs_a_program_for_its_goals_is_evaluated_and_noise_adds_what_is_executed_anew():
+    values = {"experiment": "saht", "world": {"name": "throw", "noise": 0.02}, "trainer": {"num_seeds": 2}}
+    program = programs.build(parse(values))
+    keys = program.evaluation_keys(0)
+    shapes = jax.eval_shape(program.evaluate, jax.eval_shape(program.init, program.seed_keys()), keys)
+    assert set(shapes) == {"error", "executed", *(f"{x}_{y}" for x in ("error", "area") for y in ("thrown", "placed"))}
 
 
 def test_what_a_learner_can_do_is_recorded_and_teaches_others(capsys):
