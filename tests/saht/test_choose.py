@@ -28,37 +28,48 @@ def table(gains, costs=(1.0, 1.0, 2.0, 2.0)):
     )
 
 
-def draws(config, tables, available=ALL, n=4000):
-    one = lambda key: choose.draw(config, tables, available, DIMENSIONS, key=key)  # noqa: E731
-    return jax.vmap(one)(jax.random.split(jax.random.key(0), n))
+@jax.jit
+def many(config, tables, available, keys):
+    return jax.vmap(lambda key: choose.draw(config, tables, available, DIMENSIONS, key=key))(keys)
+
+
+def draws(config, tables, available=ALL):
+    return jax.device_get(many(config, tables, available, jax.random.split(jax.random.key(0), 4000)))
+
+
+told, credit = jax.jit(choose.told), jax.jit(sgim.credit)
+SECTION = CONFIG.selection
 
 
 @settings(max_examples=20)
 @given(st.integers(0, 10**6))
 def test_credit_is_a_kalman_filter_of_every_pair(seed):
     rng = np.random.default_rng(seed)
-    section = CONFIG.selection
     state = choose.init(CONFIG, TASKS, [1.0] * WAYS).choice
     gains, doubt = np.zeros((TASKS, WAYS)), np.ones((TASKS, WAYS))
     for _ in range(4):
         n = 6
         region, way = rng.integers(0, TASKS, n), rng.integers(0, WAYS, n)
         grown, weight = rng.normal(size=n), rng.choice([0.0, 0.1, 1.0], n)
-        state = sgim.credit(section, state, *(jnp.asarray(x) for x in (region, way, grown, weight)))
+        state = credit(
+            SECTION,
+            state,
+            *(jnp.asarray(x, jnp.float32 if x.dtype == float else jnp.int32) for x in (region, way, grown, weight)),
+        )
         for r in range(TASKS):
             for s in range(WAYS):
                 mine = (region == r) & (way == s)
                 precision = 1 / doubt[r, s] + weight[mine].sum()  # of independent measurements
                 gains[r, s] = (gains[r, s] / doubt[r, s] + (weight * grown)[mine].sum()) / precision
-                doubt[r, s] = 1 / precision + section.drift
+                doubt[r, s] = 1 / precision + SECTION.drift
     np.testing.assert_allclose(state.gains, gains, atol=1e-4)
     np.testing.assert_allclose(state.doubt, doubt, rtol=1e-4)
 
 
 def test_increments_that_are_not_finite_are_counted_and_change_nothing_else():
-    section, state = CONFIG.selection, choose.init(CONFIG, TASKS, [1.0] * WAYS).choice
-    told = jnp.array([jnp.nan, jnp.inf, 0.5]), jnp.array([1.0, 0.0, 1.0])
-    after = sgim.credit(section, state, jnp.array([0, 1, 2]), jnp.array([0, 0, 0]), *told)
+    state = choose.init(CONFIG, TASKS, [1.0] * WAYS).choice
+    grown = jnp.array([jnp.nan, jnp.inf, 0.5]), jnp.array([1.0, 0.0, 1.0])
+    after = sgim.credit(SECTION, state, jnp.array([0, 1, 2]), jnp.array([0, 0, 0]), *grown)
     assert after.refused == 1 and after.gains[0, 0] == 0 and after.gains[2, 0] == 0.25
 
 
@@ -106,7 +117,7 @@ def test_a_block_tells_of_its_goal_and_of_what_was_reached_on_the_way():
     new = jnp.array([[0.0, 0.3, 0.1], [0.2, 0.3, 9.0]])
     reached = jnp.array([[True, False, True], [True, False, False]])
     seen = Progress(before=jnp.array(0.2), after=jnp.array(0.1), new=new, reached=reached)
-    after = choose.told(CONFIG, tables, choice, seen)
+    after = told(CONFIG, tables, choice, seen)
     rate = lambda weight: weight / (1 + weight)  # noqa: E731
     expected = np.zeros((TASKS, WAYS))
     expected[1, 2] = rate(1.0) * 0.5
@@ -119,7 +130,7 @@ def test_a_block_tells_of_its_goal_and_of_what_was_reached_on_the_way():
 
 def test_regions_are_cut_within_a_task_and_never_along_tasks_or_what_a_task_has_not():
     tables = choose.init(CONFIG, TASKS, [1.0] * WAYS)
-    told, split = jax.jit(choose.told), jax.jit(choose.split)
+    split = jax.jit(choose.split)
     rng = np.random.default_rng(0)
     for number in range(250):
         task = number % TASKS

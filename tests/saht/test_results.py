@@ -31,12 +31,19 @@ def algorithm(error, *, procedures=0.1, asked=(0.8, 0.2), tip=(0.4, 0.1), length
     }
 
 
+def without_draws(samples, statistic):
+    """Seeds of one algorithm hardly differ here."""
+    value = statistic(*samples)
+    return value, value - 1e-3, value + 1e-3
+
+
 def verdicts(claims, row):
     return [claim.holds for claim in claims if claim.row == row]
 
 
-def test_claims_hold_or_fail_as_the_numbers_say():
+def test_claims_hold_or_fail_as_the_numbers_say(monkeypatch):
     script = load("results/saht")
+    monkeypatch.setattr(script, "stratified", without_draws)
     good = {
         "sgim_pb": algorithm(0.1, asked=(0.5, 0.1)),
         "sgim_acts": algorithm(0.12),
