@@ -77,6 +77,16 @@ def test_a_run_learns_and_leaves_what_other_runs_do(capsys):
     assert '"unit":"iterations"' in page and page.count('"name":"hierarchy"') == 1
 
 
+def test_a_run_whose_regions_were_cut_is_shown_too():
+    shutil.copytree("whole", "cut")
+    tables = Path("cut/practice.jsonl")
+    rows = [json.loads(line) for line in tables.read_text().splitlines()]
+    for row in rows:
+        row |= {key: [*row[key], row[key][-1]] for key in ("lower", "upper", "interest")}
+    tables.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert main(["report", "cut", "--out", "cut.html"]) == 0
+
+
 def test_every_metric_is_explained_and_every_explained_metric_exists():
     row = JsonLines(Path("whole/metrics.jsonl")).read()[-1]
     ours = {key for key in row if key.startswith(("saht/", "eval/"))}
