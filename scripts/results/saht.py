@@ -11,7 +11,7 @@ interrupted goes on, so empty `--runs` when code or configs have changed. Into `
     WORLD.md      the table of errors, and that of the claims: 95 % bootstrap intervals over seeds
     WORLD.png     error over iterations by algorithm, for each task and for their mean
 
-and with `--docs` the pictures of docs/saht.md into docs/images: that one, and two figures of SGIM-PB's run.
+and with `--docs`, for pen, the pictures of docs/saht.md: that one, and two figures of SGIM-PB's run.
 A claim that something is better holds if the interval of the difference lies on that side of 0; one that names a
 number, if the mean does. With `--noise` the files are called WORLD_noise.
 """
@@ -93,7 +93,7 @@ def trained(world: str, name: str, options: argparse.Namespace) -> dict[str, Any
     """What a run of the algorithm has measured; it is made, or gone on with, if need be."""
     run = options.runs / _stem(world, options.noise) / name
     words = [*ALGORITHMS[name], "--world.name", world, "--seeds", str(options.seeds)]
-    words += ["--total-env-steps", str(options.total)]
+    words += ["--total-env-steps", str(options.total), "--trainer.checkpoint_every", "1000"]
     words += ["--world.noise", str(options.noise)] if options.noise else []
     if _done(run, options.total):
         pass
@@ -375,8 +375,7 @@ def main(arguments: list[str] | None = None) -> None:
         draw(found, place.with_suffix(".png"))
     if options.docs:
         draw(found, IMAGES / f"saht_{place.stem}.png")
-        if "sgim_pb" in found:
-            pictures(options.runs / place.stem / "sgim_pb")
+        pictures(options.runs / place.stem / "sgim_pb")
     print(place.with_suffix(".md").read_text(encoding="utf-8"))
 
 

@@ -46,7 +46,7 @@ class Saht(Experiment):
     def resolve(self, config: Config) -> Config:
         """`config` with every teacher by himself, and as much memory as the run needs."""
         section = config.saht
-        rows = section.memory or -(-config.trainer.total_env_steps // section.epoch) * section.epoch
+        rows = section.memory or _iterations(config)
         found = {"teachers": teachers.expanded(section.teachers, self.world), "memory": rows}
         return config.model_copy(update={"saht": section.model_copy(update=found)})
 
@@ -56,10 +56,10 @@ class Saht(Experiment):
             raise ConfigError(
                 f"saht: procedures need sequences of two primitives; those of {self.world.name} have {longest}"
             )
-        if config.trainer.total_env_steps > (section.memory or 0):
+        if _iterations(config) > (section.memory or 0):
             raise ConfigError(
-                f"trainer.total_env_steps: {config.trainer.total_env_steps} is more than saht.memory {section.memory}, "
-                "the sequences that the run can remember"
+                f"trainer.total_env_steps: {config.trainer.total_env_steps}, in whole epochs of {section.epoch}, is "
+                f"more than saht.memory {section.memory}, the sequences that the run can remember"
             )
 
     def data(self) -> Shown:
@@ -191,6 +191,11 @@ def ways(config: Config, world: worlds.World) -> tuple[Way, ...]:
         for number, one in enumerate(config.saht.teachers)
     ]
     return (*alone, *asked)
+
+
+def _iterations(config: Config) -> int:
+    """Those of a whole run: the last epoch is finished."""
+    return -(-config.trainer.total_env_steps // config.saht.epoch) * config.saht.epoch
 
 
 def goals(world: worlds.World) -> list[np.ndarray]:

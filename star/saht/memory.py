@@ -1,9 +1,9 @@
 """Episodic memory: every sequence that was executed, with its outcomes, in arrays that never change their shape.
 
 Distances are Euclidean over *scaled* outcomes: each dimension over its extent, and all over the root of the number of
-dimensions, so 1 is the diagonal of an outcome space. What is nearest is found exactly, in two steps. Rows lie in groups
-of `GROUP`; the minimum of each group is found first, then the best member of the best groups. A loop over chunks of
-rows ends with the rows written so far: the work grows with what is remembered, in one compiled program.
+dimensions, so 1 is the diagonal of an outcome space. What is nearest is found exactly. A loop over chunks of rows ends
+with the rows written so far: the work grows with what is remembered, in one compiled program. For the k best, groups of
+rows are compared first, then the members of the k best groups.
 
 N is the capacity, S the number of tasks, L the longest sequence, p the numbers of a primitive. All functions are of one
 learner; vmap over learners that have written as many rows.
@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from envs.worlds import World
 
-CHUNK, GROUP = 1024, 8
+CHUNK, GROUP = 1024, 8  # rows
 FAR = 1e3
 """Distance of what was not reached: no two outcomes within their bounds are farther apart than 1."""
 GAMMA = 1.2
@@ -145,15 +145,6 @@ def rank(square: Array, lengths: Array) -> Array:
     return (jnp.sqrt(square) + OFFSET) * jnp.exp(np.log(GAMMA) * lengths)
 
 
-def members(piece: Piece) -> list[Piece]:
-    """The g-th members of all groups, [..., LANES] each, for all g.
-
-    What is done with one after another is a loop over lanes alone, which a CPU does many at a time; reductions over an
-    axis, and searches for the place of a minimum, are several times slower.
-    """
-    return [jax.tree.map(lambda leaf, g=g: leaf[..., g, :], piece) for g in range(GROUP)]
-
-
 def least(
     memory: Memory, rows: Array | int, task: Array, value: Callable[[Piece], Array], shape: tuple[int, ...]
 ) -> tuple[Float[Array, "*shape"], Int[Array, "*shape"]]:
@@ -174,6 +165,7 @@ def distances(memory: Memory, rows: Array | int, found: Float[Array, "K S 4"]) -
     """How far the nearest of the first `rows` rows is from each of K outcomes in each task."""
 
     def nearer(best: Array, number: Array, task: int) -> Array:
+        # part by part: on a CPU a minimum over an axis takes eight times as long
         parts = jnp.split(piece(memory, task, number).outcomes, GROUP, axis=1)
         return functools.reduce(jnp.minimum, [squared(part, found[:, task]) for part in parts], best)
 

@@ -123,7 +123,11 @@ def test_a_learner_alone_chooses_as_it_does_among_others_and_nothing_is_compiled
 
 def test_a_run_is_made_longer_as_far_as_its_memory_goes(capsys):
     assert main(["train", "--resume", "whole", "--total-env-steps", "450", "--quiet"]) == 2
-    assert "trainer.total_env_steps: 450 is more than saht.memory 400" in capsys.readouterr().err
+    assert "450, in whole epochs of 50, is more than saht.memory 400" in capsys.readouterr().err
+    programs.build(parse(CONFIG, {"trainer.total_env_steps": 400}))
+    for rows, total in ((410, 401), (399, 399)):
+        with pytest.raises(ValueError, match=f"more than saht.memory {rows}"):
+            programs.build(parse(CONFIG, {"trainer.total_env_steps": total, "saht.memory": rows}))
 
 
 def test_a_world_that_needs_a_program_for_its_goals_is_evaluated_and_noise_adds_what_is_executed_anew():

@@ -90,7 +90,7 @@ def test_what_runs_have_left_becomes_tables_and_a_picture(tmp_path, monkeypatch)
         run.mkdir(parents=True)
         assert command[3:] == [
             "train", "saht/sgim_acts", "--world.name", "throw", "--seeds", "2", "--total-env-steps", "1000",
-            "--run-dir", str(run), "--quiet",
+            "--trainer.checkpoint_every", "1000", "--run-dir", str(run), "--quiet",
         ]  # fmt: skip
         teachers = "[{kind: action, task: placed, name: action_placed}]"
         text = f"experiment: saht\nworld: {{name: throw}}\nsaht: {{teachers: {teachers}}}\n"
@@ -124,3 +124,11 @@ def test_what_runs_have_left_becomes_tables_and_a_picture(tmp_path, monkeypatch)
     monkeypatch.setattr(script.subprocess, "run", lambda *_, **__: pytest.fail("it was made already"))
     script.main([*words, "--out", str(tmp_path)])
     shutil.rmtree(Path(run))
+
+
+@pytest.mark.parametrize("world", ["pen", "throw"])
+def test_the_page_shows_the_tables_that_were_measured(world):
+    root = Path(__file__).parents[2]
+    page = (root / "docs" / "saht.md").read_text(encoding="utf-8")
+    lines = (root / "results" / "saht" / f"{world}.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) > 10 and [line for line in lines if line not in page] == []
