@@ -108,12 +108,14 @@ def test_what_runs_an_experiment_knows_neither_agents_nor_tasks():
     for module, path in MODULES.items():
         if module.startswith(("star.training", "star.sweeps", "star.report", "star.cli", "star.config")):
             rooms = set(map(package, imported(path)))
-            assert not rooms & {"star.agent", "star.sgim", "star.abstraction", "star.learners", "envs"}, module
+            assert not rooms & {"star.agent", "star.saht", "star.sgim", "star.abstraction", "star.learners", "envs"}, (
+                module
+            )
 
 
 def test_a_run_begins_without_what_only_figures_and_intervals_need():
     """Matplotlib and scipy.stats are a third of what it takes to import the trainer."""
-    seen, left, others = set(), ["star.training.trainer", "star.agent.experiment"], set()
+    seen, left, others = set(), ["star.training.trainer", "star.agent.experiment", "star.saht.experiment"], set()
     while left:
         module = left.pop()
         if module in seen:

@@ -19,6 +19,7 @@ from star.agent import demonstrations, exam_results, exam_tables, exams, films
 from star.agent.sections import Config
 from star.cli import main
 from star.config.loading import fields, load, parse
+from star.saht.sections import Config as SahtConfig
 from star.sweeps import work
 from star.training import program as programs
 from star.training import trainer
@@ -73,7 +74,7 @@ def folder(tmp_path, monkeypatch):
     """A working directory with the shipped config files and those of the tutorial, where no command really trains."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
-    for page in ("tutorial", "howto", "experiments", "your_robot"):
+    for page in ("tutorial", "howto", "experiments", "your_robot", "worlds", "saht"):
         for name, text in files(f"docs/{page}.md").items():
             (tmp_path / name).write_text(text)
     monkeypatch.setattr(sys, "path", [*sys.path])
@@ -87,6 +88,9 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(exam_tables, "show", lambda rows, comparison, **_: None)
     monkeypatch.setattr(star_commands, "check_output", lambda out, force: None)  # pictures need OpenGL, films ffmpeg
     monkeypatch.setattr(films, "render", lambda config, show, **_: "")
+    for name in ("render", "record"):
+        monkeypatch.setattr(f"star.saht.commands.{name}", lambda options, overrides: 0)
+    monkeypatch.setattr("star.report.evaluations.evaluate", lambda config, run_dir, **_: [])
     monkeypatch.setattr("star.report.page.write", lambda runs, out, **_: "")
     monkeypatch.setattr(work, "run", lambda found, out, **_: work.Summary([], True, {"trial": 0}))
     monkeypatch.setattr(demonstrations, "record", lambda config, run_dir, out, **_: "")
@@ -98,7 +102,8 @@ def folder(tmp_path, monkeypatch):
 def test_every_command_line_of_the_pages_is_accepted(words, folder):
     for run in {run for word in words for run in re.findall(r"\bruns/[\w-]+", word)}:
         (folder / run).mkdir(parents=True)
-        (folder / run / "config.yaml").write_text(Config().to_yaml())
+        config = SahtConfig() if run.startswith("runs/saht") else Config()
+        (folder / run / "config.yaml").write_text(config.to_yaml())
     assert main(words[1:]) == 0
 
 
@@ -217,8 +222,10 @@ def test_the_navigation_lists_every_page():
 
 @pytest.mark.parametrize("page", PAGES)
 def test_settings_named_on_a_page_exist(page):
-    known = set(DEFAULTS) | {key.rsplit(".", 1)[0] for key in DEFAULTS} | set(Config.model_fields)
-    pattern = rf"(?:--)?((?:{'|'.join(Config.model_fields)})\.[a-z0-9_.]+)"
+    settings = set(DEFAULTS) | {key for key, *_ in fields(SahtConfig)}
+    sections = set(Config.model_fields) | set(SahtConfig.model_fields)
+    known = settings | {key.rsplit(".", 1)[0] for key in settings} | sections
+    pattern = rf"(?:--)?((?:{'|'.join(sections)})\.[a-z0-9_.]+)"
     for code in inline(PAGES[page]):
         named = re.fullmatch(pattern, code.split(" ")[0])
         if named and not named[1].endswith(".py"):

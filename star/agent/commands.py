@@ -167,9 +167,8 @@ def record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     return 0
 
 
-def envs() -> int:
-    """Print the tasks."""
+def envs() -> list[str]:
+    """The tasks."""
     from envs import names
 
-    print("\n".join(names()))
-    return 0
+    return list(names())

@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from envs import arena, goal_env
-from envs.common import files, modes, reading
+from envs.common import modes
 from envs.options import normal
 from envs.vector import VectorEnv
 from star import devices, learners
@@ -159,19 +159,10 @@ def resolve(config: Config, engine: str, spec: Spec) -> Config:
         if "map" in options:  # the run must not change with the file
             options["map"] = arena.load(options["map"])
     for teacher in values["sgim"]["teachers"]:
-        teacher["sha256"] = teacher["sha256"] or _checksum(teacher["source"])
+        teacher["sha256"] = teacher["sha256"] or teachers.checksum(teacher["source"])
     if values["abstraction"]["cuts"] is None and values["abstraction"]["grid"] is None:
         values["abstraction"]["cuts"] = spec.region_cuts
     return parse(values)
-
-
-def _checksum(source: str) -> str | None:
-    """That of a teacher's file; None if there is none to read, which is told when its lessons are needed."""
-    try:
-        reading.check_regular(Path(source))
-        return files.sha256(Path(source))
-    except (OSError, ValueError):
-        return None
 
 
 def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: Any, spec: Spec) -> Demonstrations:

@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
-from typing import Any
-
 from star.agent import notices
 from star.agent.migrations import FORMAT, TO_NEXT
 from star.agent.sections import Config
-from star.config.kinds import Kind, Measure, Notices
-
-
-def _lazily(module: str, name: str) -> Callable[..., Any]:
-    """The function `name` of that module of this package, which is imported when it is first called."""
-    return lambda *args, **kwargs: getattr(importlib.import_module(f"star.agent.{module}"), name)(*args, **kwargs)
+from star.config.kinds import Kind, Measure, Notices, lazily
 
 
 def _episodes(config: Config) -> int:
@@ -32,7 +23,7 @@ def _agent(config: Config) -> str:
 
 STAR = Kind(
     Config=Config,
-    build=_lazily("experiment", "Star"),
+    build=lazily("star.agent.experiment:Star"),
     measures=(
         Measure("success_final", label="success at the last step", where="on test goals", episodes=_episodes),
         Measure("success_any", label="success at any step", where="on test goals", episodes=_episodes),
@@ -58,12 +49,12 @@ STAR = Kind(
     older={"tutor.straight": False, "commander.trust": 1.0, "refinement.separate": False},
     anywhere={"env.engine": "auto"},
     commands={
-        "evaluate": _lazily("commands", "evaluate"),
-        "render": _lazily("commands", "render"),
-        "record": _lazily("commands", "record"),
-        "envs": _lazily("commands", "envs"),
-        "measure": _lazily("commands", "measure"),
-        "load": _lazily("acting", "load"),
-        "map": _lazily("growth_map", "growth_map"),
+        "evaluate": lazily("star.agent.commands:evaluate"),
+        "render": lazily("star.agent.commands:render"),
+        "record": lazily("star.agent.commands:record"),
+        "envs": lazily("star.agent.commands:envs"),
+        "measure": lazily("star.agent.commands:measure"),
+        "load": lazily("star.agent.acting:load"),
+        "map": lazily("star.agent.growth_map:growth_map"),
     },
 )

@@ -513,7 +513,7 @@ function throughput() {
 const LEVELS = [
   ["Controller", /^controller\//], ["Tutor", /^tutor\//], ["Commander", /^commander\//],
   ["Abstraction and refinement", /^(abstraction|refinement)\//], ["Forward model", /^forward_model\//],
-  ["Adjacency", /^adjacency\//], ["SGIM", /^sgim\//], ["Test episodes", /^eval\//],
+  ["Adjacency", /^adjacency\//], ["SGIM", /^sgim\//], ["Practice", /^saht\//], ["Test episodes", /^eval\//],
   ["Training episodes", /^train\//], ["Simulator", /^env\//],
 ];
 
@@ -543,6 +543,15 @@ function configurations() {
     ...runs.map(run => html("details", {}, html("summary", {}, `All settings of ${run.name}`),
       html("a", { download: "config.yaml", href: `data:text/yaml;charset=utf-8,${encodeURIComponent(run.config)}` }, "save as config.yaml"),
       html("pre", {}, run.config))));
+}
+
+function pictures() {
+  const names = [...new Set(runs.flatMap(run => run.pictures.map(one => one.name)))];
+  if (!names.length) return;
+  section("figures", "Figures", "As each run has drawn them.", ...names.map(name =>
+    html("div", { class: "grid films" }, ...runs.flatMap((run, slot) => run.pictures.filter(one => one.name === name).map(one =>
+      html("figure", { class: "film" }, html("h3", {}, key(slot), `${run.name}: ${name}`),
+        html("img", { alt: `${name} of ${run.name}`, src: `data:image/png;base64,${one.data}` })))))));
 }
 
 function films() {
@@ -594,7 +603,7 @@ function provenance() {
   page.append(html("footer", {}, `Made by star report, star-rl ${made.version}, ${made.date}.`));
 }
 
-for (const draw of [opening, evaluations, abstraction, strategies, throughput, levels, films, configurations, provenance]) draw();
+for (const draw of [opening, evaluations, abstraction, strategies, pictures, throughput, levels, films, configurations, provenance]) draw();
 if (watched) watch();
 
 // The page of `star watch` loads itself again when the run has written more, with what was chosen on it.

@@ -74,7 +74,8 @@ Train a three-level agent (Commander, Tutor, Controller) whose goal regions refi
   star watch runs/NAME                          the same page in the browser, while the run trains
   star tutor discover scores.csv skills.csv     prerequisites of skills, found from scores of students
   star configs                                  the configs that come with STAR
-  star envs                                     the tasks
+  star train saht/sgim_pb                       learners of skills, who ask teachers
+  star envs                                     the tasks and worlds
   star settings [WORD]                          every setting: meaning, range, unit and default
   star completion bash                          completion with the Tab key
 """

@@ -12,7 +12,8 @@ from star.config.section import ConfigError
 HELP = "list the configs that come with STAR, for star train and star sweep"
 DESCRIPTION = """\
 List the config files that come with this package, by name: star train ant_maze --with agents/hiro.
-Those in folders are laid over others with --with, but for paper/ and tutoring/, and sweeps/, which star sweep takes."""
+Those in folders are laid over others with --with, but for paper/, saht/ and tutoring/. star sweep takes those of
+sweeps/."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:

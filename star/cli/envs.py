@@ -9,8 +9,9 @@ from star.cli.words import refuse_settings
 from star.config import kinds
 from star.config.loading import DEFAULT
 
-HELP = "list the tasks"
+HELP = "list the tasks and worlds"
 DESCRIPTION = None
+_WIDTH = 20  # columns
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -18,6 +19,9 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
-    """Print the tasks of STAR."""
+    """Print the tasks of STAR, and what other experiments learn in."""
     refuse_settings(overrides)
-    return kinds.find(DEFAULT).commands["envs"]()
+    for name, places in kinds.places().items():
+        for place in places:
+            print(place if name == DEFAULT else f"{place:{_WIDTH}} a world of experiment {name}")
+    return 0

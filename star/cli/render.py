@@ -16,13 +16,16 @@ from star.config.section import ConfigError
 HELP = "pictures of a task or of an agent"
 DESCRIPTION = """\
 Random actions in TASK, or with --run the greedy policy of a trained agent on test goals.
+Of a world: what its teacher shows, or with --run how a learner reaches goal K of its TASK (--episode K).
 .png and .jpg hold one picture, the end of the episode; .mp4, .gif and .html the whole of it.
 A setting of the task is given as --env.options.KEY VALUE."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """Its arguments."""
-    parser.add_argument("task", nargs="?", help="one of `star envs`, or MODULE:NAME; with --run its own task")
+    parser.add_argument(
+        "task", nargs="?", help="one of `star envs`, or MODULE:NAME; with --run its own task, or one of its world"
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=".png, .jpg, .mp4, .gif or .html")
     parser.add_argument(
         "--run",
@@ -54,7 +57,12 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     """Draw what the experiment of the run draws, or a task of STAR."""
     options.run = options.run and agents.find(options.run)
-    kind = kinds.find(DEFAULT) if options.run is None else runs.kind_of([options.run], "render")
+    kind = runs.kind_of([options.run], "render") if options.run else kinds.find(_experiment(options.task))
     if "render" not in kind.commands:
         raise ConfigError(f"{options.run}: its experiment draws no episodes; see its figures in {options.run}/figures")
     return kind.commands["render"](options, overrides)
+
+
+def _experiment(task: str | None) -> str:
+    """The experiment that a task or world is of."""
+    return next((name for name, places in kinds.places().items() if task in places), DEFAULT)

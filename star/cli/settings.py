@@ -21,7 +21,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "word", nargs="?", default="", help="only settings with this in key or text, such as tutor; or an experiment"
     )
-    parser.add_argument("--experiment", default=DEFAULT, metavar="NAME", help="star (default), tutoring or MODULE:NAME")
+    parser.add_argument("--experiment", default=DEFAULT, metavar="NAME", help="star, saht, tutoring or MODULE:NAME")
 
 
 def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:

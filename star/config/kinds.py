@@ -20,7 +20,11 @@ from envs.common.errors import UserError, shown
 from star.config.run import RunConfig
 from star.config.section import ConfigError
 
-OURS: Mapping[str, str] = {"star": "star.agent.kind:STAR", "tutoring": "star.tutoring.kind:TUTORING"}
+OURS: Mapping[str, str] = {
+    "star": "star.agent.kind:STAR",
+    "saht": "star.saht.kind:SAHT",
+    "tutoring": "star.tutoring.kind:TUTORING",
+}
 """The experiments of this package, imported when they are first needed."""
 
 About = dict[str, Any]
@@ -107,9 +111,11 @@ class Kind(NamedTuple):
     """Values of settings in runs that are older than these and do not name them, where they are not the defaults."""
     anywhere: Mapping[str, Any] = {}
     """Settings of agents that act on another machine than that of their training."""
+    pictures: tuple[str, ...] = ()
+    """The names of figures that the report shows as they were drawn."""
     commands: Mapping[str, Callable[..., Any]] = {}
-    """Its own `evaluate`, `render`, `record`, `envs`; `map`, what the report draws of its tables; and, for programs,
-    `measure`, the rows of `star.evaluate`, and `load`, the agent of `star.load`."""
+    """Its own `evaluate`, `render`, `record`; `envs`, the names of what can be learnt; `map`, what the report draws of
+    its tables; and, for programs, `measure`, the rows of `star.evaluate`, and `load`, the agent of `star.load`."""
 
     def readable(self, number: Any) -> bool:
         """Whether checkpoints of the format `number` can be read."""
@@ -147,6 +153,17 @@ def find(name: Any) -> Kind:
         )
     module, _, attribute = OURS[name].partition(":")
     return getattr(importlib.import_module(module), attribute)
+
+
+def lazily(name: str) -> Callable[..., Any]:
+    """The function `name` (`module:name`) of this package, whose module is imported when it is first called."""
+    module, _, attribute = name.partition(":")
+    return lambda *args, **kwargs: getattr(importlib.import_module(module), attribute)(*args, **kwargs)
+
+
+def places() -> dict[str, list[str]]:
+    """What can be learnt in the experiments of this package: the tasks or worlds of each, by its name."""
+    return {name: find(name).commands["envs"]() for name in OURS}
 
 
 def of(config: RunConfig) -> Kind:

@@ -20,6 +20,23 @@ def _is_simple(value: Any) -> bool:
     return isinstance(value, str | int | float | NoneType)
 
 
+def simple(options: dict[str, Any]) -> dict[str, Any]:
+    """`options`, if JSON could hold them; else raises `ValueError`."""
+    for name, option in options.items():
+        if not _is_simple(option):
+            raise ValueError(f"{name}: {shown(option)} is not allowed: should be text, a number, true, false or a list")
+    return options
+
+
+def module_name(value: str) -> str:
+    """`value`, if it is no module:name, or one whose module is trusted; else raises `ValueError`."""
+    if plugins.is_plugin(value):
+        plugins.check_trust(value)
+    elif ":" in value:
+        raise ValueError("should be module:function, a module that Python can import: no path, no .py, no hyphen")
+    return value
+
+
 class EnvConfig(Section):
     """The task and the engine that simulates it."""
 
@@ -34,24 +51,8 @@ class EnvConfig(Section):
         {}, "These options differ in training from those above.", allowed="options of the task"
     )
 
-    @field_validator("name")
-    @classmethod
-    def _import_nothing_that_only_a_file_names(cls, value: str) -> str:
-        if plugins.is_plugin(value):
-            plugins.check_trust(value)
-        elif ":" in value:
-            raise ValueError("should be module:function, a module that Python can import: no path, no .py, no hyphen")
-        return value
-
-    @field_validator("options", "training")
-    @classmethod
-    def _refuse_what_no_option_holds(cls, value: dict[str, Any]) -> dict[str, Any]:
-        for name, option in value.items():
-            if not _is_simple(option):
-                raise ValueError(
-                    f"{name}: {shown(option)} is not allowed: should be text, a number, true, false or a list"
-                )
-        return value
+    _import_nothing_that_only_a_file_names = field_validator("name")(module_name)
+    _refuse_what_no_option_holds = field_validator("options", "training")(simple)
 
 
 class TrainerConfig(Section):
@@ -92,10 +93,13 @@ class TrainerConfig(Section):
         return value
 
 
+EXPERIMENTS = "star, saht, tutoring, or module:name of your own"
+
+
 class RunConfig(Section):
     """What every experiment's settings have; it adds its own sections."""
 
-    experiment: str = setting("star", "This is what learns.", allowed="star, tutoring, or module:name of your own")
+    experiment: str = setting("star", "This is what learns.", allowed=EXPERIMENTS)
     trainer: TrainerConfig = TrainerConfig()
 
     @classmethod

@@ -50,20 +50,28 @@ def evaluate(config: RunConfig, run_dir: Path, *, checkpoint: str, seed: int) ->
 
 
 def table(rows: Sequence[Row], kind: Kind) -> Table:
-    """A line for each seed of each checkpoint, and one for all where there are several."""
+    """A line for each seed of each checkpoint, and one for all where there are several.
+
+    Besides the measures there are the parts of the first one: numbers whose names begin with its own.
+    """
     shown = Table(box=box.SIMPLE_HEAD)
     shown.add_column("run")
-    for name in (kind.unit, "seed", *(measure.name for measure in kind.measures)):
+    first = f"{kind.measures[0].name}_"
+    parts = [name for name in (rows[0]["seeds"][0] if rows else ()) if name.startswith(first)]
+    names = [*(measure.name for measure in kind.measures), *parts]
+    for name in (kind.unit, "seed", *names):
         shown.add_column(Text(name), justify="right")
     for row in rows:
         begin: list[Text | str] = [Text(row["run"]), f"{row['env_steps']:,}"]
         for seed in row["seeds"]:
-            shown.add_row(*begin, str(seed["seed"]), *(f"{seed[measure.name]:.4g}" for measure in kind.measures))
+            shown.add_row(*begin, str(seed["seed"]), *(f"{seed[name]:.4g}" for name in names))
         if len(row["seeds"]) > 1:
-            shown.add_row(*begin, "all", *(_mean(row, measure.name) for measure in kind.measures))
+            shown.add_row(*begin, "all", *(_mean(row, name) for name in names))
     return shown
 
 
 def _mean(row: Row, name: str) -> Text:
-    low, high = row[f"{name}_seeds_interval"]
-    return Text(f"{row[name]:.4g} [{low:.4g}, {high:.4g}]")
+    """The mean over seeds, of a measure with its interval."""
+    mean = np.mean([seed[name] for seed in row["seeds"]])
+    low, high = row.get(f"{name}_seeds_interval") or (None, None)
+    return Text(f"{mean:.4g}" if low is None else f"{mean:.4g} [{low:.4g}, {high:.4g}]")

@@ -82,6 +82,7 @@ def _shown(run: Run, *, most: int) -> dict[str, Any]:
         "epochs": epoch_curves(run.epochs),
         "map": _map(run, most),
         "film": film(run.paths[0]),
+        "pictures": pictures(run.paths[0], kind.pictures),
         "config": run.config.to_yaml(),
     }
 
@@ -207,6 +208,13 @@ def film(run_dir: Path) -> dict[str, Any]:
         return {"name": path.name, "kind": path.suffix[1:], "data": whole}
     large = [path.name for path in newest if path.stat().st_size > MAX_FILM]
     return {"command": command, "large": large}
+
+
+def pictures(run_dir: Path, names: Sequence[str]) -> list[dict[str, str]]:
+    """The figures of a run that its kind wants shown, as far as they are there and small enough: name and base64."""
+    paths = [run_dir / "figures" / f"{name}.png" for name in names]
+    there = [path for path in paths if path.is_file() and path.stat().st_size <= MAX_FILM]
+    return [{"name": path.stem, "data": base64.b64encode(path.read_bytes()).decode()} for path in there]
 
 
 def html(shown: Mapping[str, Any]) -> str:

@@ -19,18 +19,31 @@ from star.sgim.sections import SelectionConfig as Config
 
 if TYPE_CHECKING:
     from star.sgim.cuts import follow, on_split, split
-    from star.sgim.selection import Choice, SgimState, init, interest, probabilities, progress, select, update
+    from star.sgim.selection import (
+        Choice,
+        SgimState,
+        credit,
+        init,
+        interest,
+        probabilities,
+        progress,
+        remember,
+        select,
+        update,
+    )
 
 __all__ = [
     "Choice",
     "Config",
     "SgimState",
+    "credit",
     "follow",
     "init",
     "interest",
     "on_split",
     "probabilities",
     "progress",
+    "remember",
     "select",
     "split",
     "update",

@@ -8,6 +8,9 @@ from pydantic import Field, model_validator
 
 from star.config.section import Batch, Positive, Section, setting
 
+TeacherName = Annotated[str, Field(pattern=r"^[a-z0-9_]+$", max_length=64)]
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
 
 class SelectionConfig(Section):
     """SGIM's choice of regions, strategies and goals."""
@@ -64,9 +67,7 @@ class EpochSelectionConfig(SelectionConfig):
 class TeacherConfig(Section):
     """One teacher: demonstrations, what they are used for, and what it takes to ask."""
 
-    name: Annotated[str, Field(pattern=r"^[a-z0-9_]+$", max_length=64)] = setting(
-        ..., "Metrics and figures call the teacher by this name."
-    )
+    name: TeacherName = setting(..., "Metrics and figures call the teacher by this name.")
     kind: Literal["action", "outcome", "decomposition"] = setting(
         ..., "The teacher shows movements to imitate, outcomes to aim at, or routes to a goal."
     )
@@ -75,9 +76,7 @@ class TeacherConfig(Section):
         "The demonstrations come from this file, or are shortest paths on the map, which show routes only.",
         allowed="a file (.npz), or map",
     )
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = setting(
-        None, "The file has this checksum; a run notes it, and goes on with no other file."
-    )
+    sha256: Sha256 | None = setting(None, "The file has this checksum; a run notes it, and goes on with no other file.")
     flaw: Literal["repetitive", "wrong_half", "other_body"] | None = setting(
         None, "This makes it a poor teacher, for experiments."
     )

@@ -205,7 +205,7 @@ def update(
     counted = (given & finite).astype(jnp.float32)
     competences = jnp.where(counted > 0, competences, 0.0)
     state = _credit(config, state, choice, competences, counted)
-    state = _remember(config, state, choice, competences, counted)
+    state = remember(config, state, choice.region, choice.goal, competences, counted)
     return state.replace(refused=state.refused + jnp.sum(given & ~finite), blocks=state.blocks + 1)
 
 
@@ -287,12 +287,20 @@ def _credit(config: SelectionConfig, state: SgimState, choice: Choice, competenc
     )
 
 
-def _remember(
-    config: SelectionConfig, state: SgimState, choice: Choice, competences: Array, counted: Array
+def remember(
+    config: SelectionConfig,
+    state: SgimState,
+    region: Int[Array, "N"],
+    goals: Float[Array, "N d"],
+    competences: Float[Array, "N"],
+    counted: Float[Array, "N"],
 ) -> SgimState:
-    """Write to each region's window, over its oldest episodes, at most `per_block` of this block drawn at random."""
+    """Write to each region's window, over its oldest episodes, at most `per_block` of this block drawn at random.
+
+    Where `counted` is 0 an episode is left out.
+    """
     order = jax.random.permutation(jax.random.fold_in(modes.key(0), state.blocks), len(competences))
-    region, goals, competences, counted = (x[order] for x in (choice.region, choice.goal, competences, counted))
+    region, goals, competences, counted = (x[order] for x in (region, goals, competences, counted))
     capacity = len(state.written)
     mine = (region[:, None] == jnp.arange(capacity)) * counted[:, None].astype(jnp.int32)
     rank = jnp.take_along_axis(jnp.cumsum(mine, axis=0), region[:, None], axis=1)[:, 0] - 1
@@ -303,6 +311,38 @@ def _remember(
         goals=state.goals.at[cell].set(goals, mode="drop"),
         competences=state.competences.at[cell].set(competences, mode="drop"),
         written=state.written + jnp.minimum(mine.sum(axis=0), config.per_block),
+    )
+
+
+def credit(
+    config: SelectionConfig,
+    state: SgimState,
+    region: Int[Array, "N"],
+    strategy: Int[Array, "N"],
+    increments: Float[Array, "N"],
+    weight: Float[Array, "N"],
+) -> SgimState:
+    """The state after one block, of a learner that knows the competence of each goal before and after it.
+
+    Such an increment is due to the strategy alone, f = 1, and free of the noise of drawing another goal. One of
+    `weight` w tells as much as w of weight 1; those that are not finite are counted as `refused`. With the sum W of
+    weights and the mean increment m of a pair in this block,
+
+        P += k (m - P),    v <- (1 - k) v + drift,    k = W v / (1 + W v).
+    """
+    finite = jnp.isfinite(increments)
+    refused = jnp.sum(~finite & (weight > 0))
+    weight = jnp.where(finite, weight, 0.0)
+    pair, zero = (region, strategy), jnp.zeros_like(state.gains)
+    total = zero.at[pair].add(weight)
+    mean = zero.at[pair].add(weight * jnp.where(finite, increments, 0.0)) / jnp.where(total > 0, total, 1.0)
+    rate = total * state.doubt / (1 + total * state.doubt)
+    return state.replace(
+        gains=state.gains + rate * (mean - state.gains),
+        doubt=state.doubt * (1 - rate) + config.drift,
+        episodes=state.episodes + total,
+        refused=state.refused + refused,
+        blocks=state.blocks + 1,
     )
 
 

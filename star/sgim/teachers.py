@@ -157,7 +157,7 @@ def load(path: Path, *, env: str, spec: Spec, sha256: str | None = None) -> Demo
       UserError: in one line, if there is no such file, it is malformed, made for something else, or has another
         checksum than `sha256`.
     """
-    arrays = _read(path)
+    arrays = read(path)
     if sha256 is not None and files.sha256(path) != sha256:
         raise ConfigError(f"{path}: is not the file that the run began with; its SHA-256 was {sha256}")
     try:
@@ -172,6 +172,15 @@ def load(path: Path, *, env: str, spec: Spec, sha256: str | None = None) -> Demo
     return Demonstrations(**{k: jnp.asarray(v, jnp.int32 if k == "lengths" else None) for k, v in arrays.items()})
 
 
+def checksum(source: str) -> str | None:
+    """The SHA-256 of a teacher's file; None if there is none to read, which is told when its lessons are needed."""
+    try:
+        reading.check_regular(Path(source))
+        return files.sha256(Path(source))
+    except (OSError, ValueError):
+        return None
+
+
 _SHAPES = {
     "starts": ("N", "d"),
     "outcomes": ("N", "d"),
@@ -183,8 +192,8 @@ _SHAPES = {
 _TRAJECTORIES = ("states", "actions", "lengths")
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    """The arrays in the file `path`."""
+def read(path: Path) -> dict[str, np.ndarray]:
+    """The arrays in the file `path`; raises `UserError` in one line if it is no plain .npz of a moderate size."""
     try:
         reading.check_regular(path)
         with zipfile.ZipFile(path) as archive:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import envs
+from envs import worlds
 from envs.common.errors import UserError
 from star.agent import exam_tables, exams
 from star.agent.sections import Config
@@ -251,7 +252,9 @@ def test_settings_are_found_by_a_part_of_key_or_text(word, keys, capsys):
 
 def test_envs_lists_every_task(capsys):
     assert main(["envs"]) == 0
-    assert capsys.readouterr().out.split() == list(envs.names())
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == [*envs.names(), *worlds.names()]
+    assert [line for line in lines if " " in line] == lines[-len(worlds.names()) :]
 
 
 @pytest.mark.parametrize(

@@ -413,6 +413,7 @@ def test_a_number_at_the_edge_of_its_range_is_taken_and_one_beyond_it_refused(on
 
 def test_every_shipped_file_is_valid_and_names_a_task(pytestconfig):
     import envs
+    from envs import worlds
 
     configs = pytestconfig.rootpath / "configs"
     paths = sorted(set(configs.rglob("*.yaml")) - set(configs.glob("sweeps/*.yaml")))
@@ -421,7 +422,9 @@ def test_every_shipped_file_is_valid_and_names_a_task(pytestconfig):
         config = load(path)
         if path.parent.name in kinds.OURS:
             assert config.experiment == path.parent.name
-        else:
+        if config.experiment == "saht":
+            assert config.world.name in worlds.names()
+        if config.experiment == "star":
             assert config.env.name in envs.names()
 
 

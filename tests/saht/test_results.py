@@ -1,0 +1,134 @@
+"""The script that measures the claims: what it makes of runs, and that a claim that fails is told as failed."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.scripts import load
+
+TASKS = ("tip", "pen", "line", "joystick_1", "joystick_2", "character")
+
+
+def algorithm(error, *, procedures=0.1, asked=(0.8, 0.2), tip=(0.4, 0.1), length=3):
+    """Four seeds of an algorithm with these numbers."""
+    chosen = np.full((4, 6, 2), 100 * np.array([1 - procedures, procedures]))
+    chosen[:, -1] = [40, 60]
+    played = np.zeros((4, 6, 4))
+    played[:, :-1, 0] = played[:, -1, length - 1] = 1
+    errors = [[[x * level for x in (0.99, 1.0, 1.0, 1.01)] for level in (2 * error, error)]]
+    return {
+        "steps": [12_500, 25_000],
+        "wall_s": 1.0,
+        "errors": dict.fromkeys(("mean", *TASKS), errors[0]),
+        "ways": ["actions", "procedures"],
+        "chosen": chosen.tolist(),
+        "played": played.tolist(),
+        "requests": np.linspace([asked[0]] * 4, [asked[1]] * 4, 10).tolist(),
+        "tasks": {"tip": np.linspace([tip[0]] * 4, [tip[1]] * 4, 10).tolist()},
+    }
+
+
+def without_draws(samples, statistic):
+    """Seeds of one algorithm hardly differ here."""
+    value = statistic(*samples)
+    return value, value - 1e-3, value + 1e-3
+
+
+def verdicts(claims, row):
+    return [claim.holds for claim in claims if claim.row == row]
+
+
+def test_claims_hold_or_fail_as_the_numbers_say(monkeypatch):
+    script = load("results/saht")
+    monkeypatch.setattr(script, "stratified", without_draws)
+    good = {
+        "sgim_pb": algorithm(0.1, asked=(0.5, 0.1)),
+        "sgim_acts": algorithm(0.12),
+        "im_pb": algorithm(0.15),
+        "sagg_riac": algorithm(0.4),
+        "sgim_pb_even": algorithm(0.13),
+    }
+    claims = script.claims_of_pen(good)
+    assert all(claim.holds for claim in claims) and {claim.row for claim in claims} == {*"efghij", "even"}
+    bad = {
+        "sgim_pb": algorithm(0.12, procedures=0.3, asked=(0.5, 0.5), tip=(0.1, 0.1)),
+        "sgim_acts": algorithm(0.12),
+        "im_pb": algorithm(0.4, length=1),
+        "sagg_riac": algorithm(0.4),
+        "sgim_pb_even": algorithm(0.12),
+    }
+    failed = script.claims_of_pen(bad)
+    assert verdicts(failed, "f") == [False] * 3 and not any(verdicts(failed, "e") + verdicts(failed, "even"))
+    assert verdicts(failed, "g") == [True, False, False, False]  # the character's procedures are as before
+    assert [verdicts(failed, row) for row in "hij"] == [[False]] * 3
+    told = script.table(bad, failed)
+    assert told.count("**failed**") == sum(not claim.holds for claim in failed) and "| sgim_pb | 0.120 [" in told
+
+
+def test_an_interval_that_reaches_zero_is_no_difference():
+    script = load("results/saht")
+    one, other = np.array([0.1, 0.3, 0.2, 0.2]), np.array([0.3, 0.2, 0.2, 0.2])
+    claim = script._less("f", "", one, other)
+    assert claim.value < 0 < claim.high and not claim.holds
+
+
+def test_a_name_that_is_no_algorithm_is_refused(tmp_path):
+    script = load("results/saht")
+    with pytest.raises(SystemExit, match="sgim_bp: no such algorithm; known are random, sagg_riac"):
+        script.main(["pen", "sgim_bp", "--out", str(tmp_path)])
+
+
+def test_what_runs_have_left_becomes_tables_and_a_picture(tmp_path, monkeypatch):
+    """Of a run of throw, whose rows are made here."""
+    script = load("results/saht")
+    run = tmp_path / "runs" / "throw" / "sgim_acts"
+
+    def train(command, **_):
+        run.mkdir(parents=True)
+        assert command[3:] == [
+            "train", "saht/sgim_acts", "--world.name", "throw", "--seeds", "2", "--total-env-steps", "1000",
+            "--trainer.checkpoint_every", "1000", "--run-dir", str(run), "--quiet",
+        ]  # fmt: skip
+        teachers = "[{kind: action, task: placed, name: action_placed}]"
+        text = f"experiment: saht\nworld: {{name: throw}}\nsaht: {{teachers: {teachers}}}\n"
+        (run / "config.yaml").write_text(text)
+        names = ("actions", "action_placed")
+        rows = [
+            {"seed": seed, "env_steps": step, "wall_s": 1.0, "env_steps_per_s": 9, "eval/error": 0.2 + 0.1 * seed}
+            | {f"eval/error_{task}": 0.2 for task in ("thrown", "placed")}
+            | {f"saht/task_{task}": 0.5 for task in ("thrown", "placed")}
+            | {f"saht/strategy_{name}": 0.25 + 0.5 * i for i, name in enumerate(names)}
+            for step in (500, 1000)
+            for seed in (0, 1)
+        ]
+        tables = [
+            {"seed": seed, "env_steps": 1000, "chosen": [[9, 1], [4, 6]], "played": [[10], [10]]} for seed in (0, 1)
+        ]
+        start = [{"commit": "abc", "device": "CPU", "python": "3", "versions": {}}]
+        for name, lines in (("metrics", rows), ("practice", tables), ("provenance", start)):
+            (run / f"{name}.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+    monkeypatch.setattr(script.subprocess, "run", train)
+    words = ["throw", "sgim_acts", "--seeds", "2", "--total", "1000", "--runs", str(tmp_path / "runs")]
+    script.main([*words, "--out", str(tmp_path)])
+    told = json.loads((tmp_path / "throw.json").read_text())
+    found = told["algorithms"]["sgim_acts"]
+    assert found["errors"]["mean"][-1] == [0.2, 0.3] and found["requests"][0] == [0.75, 0.75]
+    assert found["ways"] == ["actions", "action_placed"] and found["commit"] == "abc"
+    own = [claim["value"] for claim in told["claims"] if claim["row"] == "c"]
+    assert own == [0.0, 1.0]  # thrown has no teacher
+    assert (tmp_path / "throw.png").stat().st_size > 1000
+    monkeypatch.setattr(script.subprocess, "run", lambda *_, **__: pytest.fail("it was made already"))
+    script.main([*words, "--out", str(tmp_path)])
+    shutil.rmtree(Path(run))
+
+
+@pytest.mark.parametrize("world", ["pen", "throw"])
+def test_the_page_shows_the_tables_that_were_measured(world):
+    root = Path(__file__).parents[2]
+    page = (root / "docs" / "saht.md").read_text(encoding="utf-8")
+    lines = (root / "results" / "saht" / f"{world}.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) > 10 and [line for line in lines if line not in page] == []
