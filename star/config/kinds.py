@@ -163,7 +163,7 @@ def lazily(name: str) -> Callable[..., Any]:
 
 def places() -> dict[str, list[str]]:
     """What can be learnt in the experiments of this package: the tasks or worlds of each, by its name."""
-    return {name: find(name).commands["envs"]() for name in OURS}
+    return {name: commands["envs"]() for name in OURS if "envs" in (commands := find(name).commands)}
 
 
 def of(config: RunConfig) -> Kind:
