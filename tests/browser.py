@@ -29,7 +29,7 @@ def started(folder):
         try:
             port = _wait(lambda: (folder / "DevToolsActivePort").read_text().split()[0])
             address = _wait(lambda: next(tab for tab in _tabs(port) if tab["type"] == "page"))["webSocketDebuggerUrl"]
-            with connect(address, max_size=None) as socket:
+            with connect(address, max_size=None, ping_interval=None) as socket:
                 browser = Browser(socket)
                 yield browser
                 browser.send("Browser.close")

@@ -137,6 +137,7 @@ def test_in_a_browser_it_renews_itself_and_keeps_what_was_chosen(browser, make, 
     run_dir = make(rows=[])
     row = "document.querySelector('table.runs').textContent"
     with served(run_dir) as page:
+        browser.send("Emulation.setDeviceMetricsOverride", width=800, height=400, deviceScaleFactor=1, mobile=False)
         browser.send("Page.navigate", url=f"http://localhost:{page.port}/")
         until(browser, "document.body?.textContent.includes('as soon as it is complete')")
         lines(run_dir / "metrics.jsonl", metrics(2, (0, 1)))
