@@ -52,7 +52,7 @@ def version(text):
 
 
 def test_the_page_is_told_of_what_the_run_writes_and_of_its_end(make, monkeypatch):
-    monkeypatch.setattr(watching, "_LAST_S", 1.0)
+    monkeypatch.setattr(watching, "_LAST_S", 3.0)
     run_dir = make(rows=[])
     with served(run_dir) as page:
         status, text = get(page.port, "/")
@@ -128,12 +128,13 @@ def test_each_checkpoint_is_drawn_once_and_what_goes_wrong_is_said_once(make, mo
     with served(run_dir, films=True) as page:
         for number in (1, 2, 3):
             (run_dir / "checkpoints" / f"{100 * number}").mkdir(parents=True)
-            time.sleep(0.2)
+            while len(drawn) < number:
+                time.sleep(0.01)
     assert drawn == 3 * [run_dir] and page.said[1:] == ["no film of 200 env steps: pictures need OpenGL"]
 
 
 def test_in_a_browser_it_renews_itself_and_keeps_what_was_chosen(browser, make, monkeypatch):
-    monkeypatch.setattr(watching, "_LAST_S", 2.0)
+    monkeypatch.setattr(watching, "_LAST_S", 5.0)
     run_dir = make(rows=[])
     row = "document.querySelector('table.runs').textContent"
     with served(run_dir) as page:
