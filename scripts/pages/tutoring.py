@@ -8,12 +8,11 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+from scripts.pages import charts
 from star.config.loading import load
 from star.training import trainer
 from star.training.journal import Journal
 from star.tutoring import figures
-
-IMAGES = Path(__file__).parents[2] / "docs" / "images"
 
 
 def main() -> None:
@@ -28,7 +27,7 @@ def main() -> None:
     drawn = {"prerequisites": found, "tutor_skills": figures.skills_figure(tables)}
     drawn["tutor_graph"] = figures.graphs_figure(tables)
     for name, figure in drawn.items():
-        figure.savefig(IMAGES / f"{name}.png", dpi=90)
+        charts.save(figure, name, dpi=90)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from envs import worlds
+from scripts.pages import charts
 from star.config.loading import load_run
 from star.report.statistics import stratified
 from star.saht.experiment import Saht
@@ -38,7 +39,6 @@ from star.saht.figures import colour, plain_ticks
 from star.training.journal import Journal, by_step
 
 ROOT = Path(__file__).parents[2]
-IMAGES = ROOT / "docs" / "images"
 STAR = (sys.executable, "-m", "star")
 TOTAL = {"pen": 25_000, "throw": 5_000}
 
@@ -310,7 +310,7 @@ def table(found: Mapping[str, Any], claims: Sequence[Claim]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def draw(found: Mapping[str, Any], path: Path) -> None:
+def draw(found: Mapping[str, Any]) -> Figure:
     """The error over iterations of each algorithm: mean over seeds."""
     tasks = list(next(iter(found.values()))["errors"])
     columns = min(4, len(tasks))
@@ -331,7 +331,7 @@ def draw(found: Mapping[str, Any], path: Path) -> None:
     figure.supxlabel("thousand iterations", size=9)
     figure.supylabel("error", size=9)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center", fontsize="small")
-    figure.savefig(path, dpi=80)
+    return figure
 
 
 def pictures(run: Path) -> None:
@@ -339,7 +339,7 @@ def pictures(run: Path) -> None:
     config, journal = load_run(run, {}), Journal.of(run, tables="practice")
     drawn = Saht(config).figures(journal.metrics.read(), journal.tables.read())
     for name in ("curriculum", "hierarchy"):
-        drawn[name].savefig(IMAGES / f"saht_{name}.png", dpi=80)
+        charts.save(drawn[name], f"saht_{name}", dpi=80)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -372,9 +372,9 @@ def main(arguments: list[str] | None = None) -> None:
         told = {"world": options.world, "noise": options.noise, "claims": [one._asdict() for one in claims]}
         place.write_text(json.dumps(told | {"algorithms": found}) + "\n", encoding="utf-8")
         place.with_suffix(".md").write_text(table(found, claims), encoding="utf-8")
-        draw(found, place.with_suffix(".png"))
+        draw(found).savefig(place.with_suffix(".png"), dpi=80)
     if options.docs:
-        draw(found, IMAGES / f"saht_{place.stem}.png")
+        charts.save(draw(found), f"saht_{place.stem}", dpi=80)
         pictures(options.runs / place.stem / "sgim_pb")
     print(place.with_suffix(".md").read_text(encoding="utf-8"))
 

@@ -223,5 +223,6 @@ def html(shown: Mapping[str, Any]) -> str:
     parts = {ending: assets.joinpath(f"report.{ending}").read_text(encoding="utf-8") for ending in ("css", "js")}
     # no text can end the element that holds it
     parts["json"] = json.dumps(shown, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    parts["connect"] = "self" if shown.get("watched") else "none"  # only a page that is served asks for more
     page = assets.joinpath("report.html").read_text(encoding="utf-8")
-    return re.sub(r"%(css|js|json)%", lambda found: parts[found[1]], page)  # once: data may hold such words too
+    return re.sub(r"%(css|js|json|connect)%", lambda found: parts[found[1]], page)  # once: data may hold such words too

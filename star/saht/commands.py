@@ -19,7 +19,7 @@ from star.config.loading import load_to_act, parse
 from star.config.section import ConfigError
 from star.saht import evaluation, teachers
 from star.saht.experiment import Saht
-from star.saht.memory import FAR, scale_of
+from star.saht.memory import FAR
 from star.saht.teachers import Demonstrations
 from star.training.checkpoint import load_agent
 
@@ -115,7 +115,7 @@ def record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     """Write what a learner does best for goals drawn evenly in each task, as demonstrations for others."""
     files.check(options.out, (".npz",), force=options.force)
     experiment, memory, rows = _learner(options, overrides)
-    world, scale = experiment.world, scale_of(experiment.world)
+    world, scale = experiment.world, experiment.scale
     tasks: list[str] = []
     found: list[np.ndarray] = []
     for task, name in enumerate(world.names):

@@ -33,11 +33,9 @@ from star.sgim.selection import Choice, SgimState
 from star.tutoring import graphs
 from star.tutoring.sections import TeachingConfig
 
-RECENT, KEEPS, EXPLORES = (
-    8,
-    0.75,
-    0.2,
-)  # of ZPDES: scores remembered, share of the old quality kept, choices made evenly
+RECENT = 8  # scores that ZPDES remembers of each skill
+KEEPS = 0.75  # share of an old quality that it keeps
+EXPLORES = 0.2  # share of its choices that are made evenly
 
 
 class Plan(struct.PyTreeNode):

@@ -82,8 +82,10 @@ def test_it_ends_with_the_run_and_leaves_a_page_that_asks_no_more(make, monkeypa
     run_dir = make()
     watched = watching.Watched(run_dir, load_run(run_dir, {}))
     assert version(watched.html()) == watched.version()
+    assert "connect-src 'self'" in watched.html()
     watched.ended.set()
     assert '"watched":null' in watched.html()
+    assert "connect-src 'none'" in watched.html()
     with served(run_dir) as page:
         assert not page.over.is_set()
     with pytest.raises(OSError):
