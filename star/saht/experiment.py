@@ -20,7 +20,7 @@ from star.saht.sections import Config, Learner
 from star.saht.strategies import Setting, Way
 from star.saht.teachers import Shown
 from star.sgim import selection
-from star.training.experiment import Experiment, over_seeds
+from star.training.experiment import Experiment, numbers, over_seeds
 from star.training.journal import mean
 
 EPOCHS = 2**31 - 1  # the stream of keys of epochs, apart from those of blocks
@@ -150,7 +150,7 @@ class Saht(Experiment):
 
     def rows(self, evaluated: Mapping[str, Any]) -> list[dict[str, Any]]:
         """The errors of each seed."""
-        return [{name: float(x[i]) for name, x in evaluated.items()} for i in range(len(evaluated["error"]))]
+        return numbers(evaluated)
 
     def tables(self, hyper: Learner, state: State, seeds: Sequence[int]) -> list[dict[str, Any]]:
         """Regions of goals with their interest, and all that is counted."""

@@ -50,6 +50,11 @@ def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
     return lifted
 
 
+def numbers(evaluated: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """What was evaluated, [S] by its name, as plain numbers by their names for each seed."""
+    return [dict(zip(evaluated, map(float, row), strict=True)) for row in zip(*evaluated.values(), strict=True)]
+
+
 def _axis(hyper: Any) -> int | None:
     """The axis of `hyper` under a vmap over seeds: none if its floats are scalars."""
     leaves = jax.tree.leaves(hyper)

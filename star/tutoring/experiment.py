@@ -12,7 +12,7 @@ from flax import struct
 from jax import random
 from jaxtyping import Array, Bool, Float, Int
 
-from star.training.experiment import Experiment, over_seeds
+from star.training.experiment import Experiment, numbers, over_seeds
 from star.training.journal import mean
 from star.tutoring import graphs, tracing, tutors
 from star.tutoring import students as pupils
@@ -88,7 +88,7 @@ class Tutoring(Experiment):
 
     def rows(self, evaluated: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
         """The same as numbers."""
-        return [{name: float(x[i]) for name, x in evaluated.items()} for i in range(len(evaluated["level"]))]
+        return numbers(evaluated)
 
     def tables(self, hyper: Any, state: State, seeds: Sequence[int]) -> list[dict[str, Any]]:
         """Levels and practice of each skill, and the graphs."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from star.config.run import RunConfig
+from star.config.run import EXPERIMENTS, RunConfig
 from star.config.section import Batch, Positive, Repeats, Section, setting
 from star.sgim.sections import SelectionConfig
 
@@ -99,6 +99,7 @@ class DiscoveryConfig(Section):
 class Config(RunConfig):
     """All settings of tutoring."""
 
+    experiment: str = setting("tutoring", "This is what learns.", allowed=EXPERIMENTS)
     course: CourseConfig = CourseConfig()
     students: StudentsConfig = StudentsConfig()
     teaching: TeachingConfig = TeachingConfig()
