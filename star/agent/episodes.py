@@ -12,7 +12,8 @@ from star.agent.play import Episode
 from star.report import statistics
 
 MEASURES = ("success_any", "success_final")
-FAILURES = ("flipped", "fallen", "stuck", "out_of_time")
+MISHAPS = ("flipped", "fallen", "unhealthy")  # fields of `Episode`
+FAILURES = (*MISHAPS, "stuck", "out_of_time")
 """Why an episode never reached its goal: the first that holds."""
 
 

@@ -23,7 +23,7 @@ from envs import goal_env, routes
 from envs.common import modes
 from envs.vector import VectorEnv
 from star.agent import environment
-from star.agent.episodes import MEASURES, Trials, failures, success_behind, summarise, summarise_way
+from star.agent.episodes import MEASURES, MISHAPS, Trials, failures, success_behind, summarise, summarise_way
 from star.agent.play import Episode, greedy
 from star.agent.sections import Config
 from star.config.loading import parse
@@ -162,25 +162,17 @@ def player(course: Course, episodes: int) -> Callable[[Any, Any, jax.Array], Tri
         position, success = jax.tree.map(
             lambda many, end: jnp.concatenate([many, end[None]]), moments, look(streams.env)
         )
-        return measure(
-            streams.episode,
-            position,
-            success,
-            goal=spec.goal(streams.env.obs),
-            fallen=streams.env.metrics["fallen"],
-            radius=spec.success_radius,
-        )
+        goal = spec.goal(streams.env.obs)
+        return measure(streams.episode, position, success, goal=goal, radius=spec.success_radius)
 
     return jax.jit(lambda agent, states, keys: jax.vmap(lambda state, key: one(agent, state, key))(states, keys))
 
 
-def measure(
-    ended: Episode, position: jax.Array, success: jax.Array, *, goal: jax.Array, fallen: jax.Array, radius: float
-) -> Trials:
+def measure(ended: Episode, position: jax.Array, success: jax.Array, *, goal: jax.Array, radius: float) -> Trials:
     """What E episodes took, from `position` [T + 1, E, d] and `success` [T + 1, E] at every moment.
 
-    As in the statistics of episodes, the moment before the first step does not count as success. `fallen` [E] is 1
-    where the body lies in a gap at the end. It is stuck if it stays within `radius` of its end for the last half.
+    As in the statistics of episodes, the moment before the first step does not count as success. A body is
+    stuck that stays within `radius` of its end for the last half of the time.
     """
     reached = success[1:] > 0
     steps = jnp.where(reached.any(axis=0), jnp.argmax(reached, axis=0) + 1, len(reached))
@@ -188,7 +180,7 @@ def measure(
     path = jnp.where(jnp.arange(len(legs))[:, None] < steps, legs, 0.0).sum(axis=0)
     late = position[len(legs) // 2 :]
     stuck = (jnp.linalg.norm(late - late[-1], axis=-1) <= radius).all(axis=0)
-    reasons = jnp.stack([ended.flipped > 0, fallen > 0, stuck, jnp.ones_like(stuck)])
+    reasons = jnp.stack([*(getattr(ended, name) > 0 for name in MISHAPS), stuck, jnp.ones_like(stuck)])
     return Trials(
         episode=ended,
         steps=steps.astype(jnp.float32),

@@ -118,32 +118,31 @@ def test_the_episode_of_a_number_is_recorded_as_it_was_evaluated(evaluated, stil
     assert bool(recorded.success[1:].any()) == (1 not in rows[1]["seeds"][1]["failed"])
 
 
-def measured(ended, position, success, fallen=0.0, radius=1.0):
+def measured(ended, position, success, radius=1.0):
     """Trials with goals at the origin."""
-    goal, fallen = jnp.zeros(position.shape[1:]), jnp.broadcast_to(fallen, position.shape[1:2])
-    return exams.measure(ended, jnp.asarray(position), jnp.asarray(success), goal=goal, fallen=fallen, radius=radius)
+    goal = jnp.zeros(position.shape[1:])
+    return exams.measure(ended, jnp.asarray(position), jnp.asarray(success), goal=goal, radius=radius)
 
 
 def test_the_reason_of_a_failure_is_the_first_that_holds():
     rng = np.random.default_rng(1)
     position = rng.normal(size=(9, 60, 2)).cumsum(axis=0)
-    success_any, flipped, fallen = (rng.random((3, 60)) < [[0.2], [0.3], [0.3]]).astype(float)
-    ended = Episode.start(60).replace(success_any=jnp.asarray(success_any), flipped=jnp.asarray(flipped))
-    found = measured(ended, position, np.zeros((9, 60)), fallen, radius=2.5)
+    success_any, *mishaps = (rng.random((4, 60)) < [[0.2], [0.3], [0.3], [0.1]]).astype(float)
+    holds = dict(zip(episodes.MISHAPS, mishaps, strict=True))
+    ended = Episode.start(60).replace(success_any=jnp.asarray(success_any), **jax.tree.map(jnp.asarray, holds))
+    found = measured(ended, position, np.zeros((9, 60)), radius=2.5)
 
     def slow(e):
         if success_any[e]:
             return -1
         still = all(np.hypot(*(position[t, e] - position[8, e])) <= 2.5 for t in range(4, 9))
-        return episodes.FAILURES.index(
-            "flipped" if flipped[e] else "fallen" if fallen[e] else "stuck" if still else "out_of_time"
-        )
+        reasons = [*(mishap[e] for mishap in mishaps), still, True]
+        return next(number for number, reason in enumerate(reasons) if reason)
 
-    assert found.failure.tolist() == [slow(e) for e in range(60)] and set(found.failure.tolist()) == {-1, 0, 1, 2, 3}
+    assert found.failure.tolist() == [slow(e) for e in range(60)] and set(found.failure.tolist()) == {*range(-1, 5)}
     counted = episodes.failures(found)
-    assert (
-        sum(counted.values()) == (success_any == 0).sum() and counted["flipped"] == ((1 - success_any) * flipped).sum()
-    )
+    assert sum(counted.values()) == (success_any == 0).sum()
+    assert counted["flipped"] == ((1 - success_any) * holds["flipped"]).sum()
 
 
 def test_time_and_way_count_until_the_goal_is_first_reached():
