@@ -345,11 +345,14 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
         region, jnp.array([target, 0]), jnp.array([target, 0]), ones, region, ones, *[0 * ones] * 3, goal=goal
     )
     outcome = Outcome(start=start, lower=start, upper=start, end=end, weight=ones)
-    known = state.commander
-    learnt = jax.jit(commander.follow)(
-        config.commander, known, change, known, Finished(decision, outcome), jnp.zeros_like(known.q[0])
-    )
+    known, follow = state.commander, jax.jit(commander.follow)
+    of_epoch = Finished(decision, outcome), jnp.zeros_like(known.q[0])
+    learnt = follow(config.commander, known, change, known, *of_epoch)
     np.testing.assert_array_equal(learnt.q, expected)
+    without = known.replace(model=None)
+    by_values = follow(config.commander.model_copy(update={"learner": "q"}), without, change, without, *of_epoch)
+    np.testing.assert_array_equal(by_values.q, expected)
+    assert by_values.model is None
     assert float(learnt.chosen[0]) == float(learnt.chosen[count]) == 0.5
     led = np.argwhere(np.asarray(learnt.model.led))
     assert led.tolist() == [[1, 0, target, count], [1, count, count, 0]]
