@@ -11,7 +11,7 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
-    " --xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE"
+    + " --xla_cpu_opt_preset=CPU_OPT_PRESET_FAST_COMPILE"
     + " --xla_cpu_use_fusion_emitters=false" * version("jax").startswith("0.10."),
 )
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))

@@ -3,8 +3,8 @@
     python scripts/checks/wheel.py
 
 Builds the wheel, unpacks it into an empty folder, and there trains, lists, evaluates and reports a small run, acts with
-an agent of the package in a Gymnasium loop of three lines, and draws a task where pictures can be drawn. Dependencies are
-those of the Python that runs this. Root does all of it as another user who may run this Python; with none, and for
+an agent of the package in a Gymnasium loop of three lines, and draws a task where pictures can be drawn. Dependencies
+are those of the Python that runs this. Root does all of it as another user who may run this Python; with none, and for
 anybody else, only the home is another. Ends with code 1 at the first failure.
 """
 
