@@ -114,14 +114,20 @@ class Fused:
 # What no file after the first few takes longer than is how far apart the workers end.
 LONGEST = (
     "test_trainer.py",
-    "test_faults.py",
     "test_docs.py",
-    "test_strategies.py",
     "test_epoch.py",
+    "test_strategies.py",
+    "test_faults.py",
+    "test_wheel.py",
+    "test_acting.py",
     "test_scripts.py",
     "test_sweep.py",
-    "test_tasks.py",
+    "test_selection.py",
+    "test_play.py",
     "test_devices.py",
+    "test_tasks.py",
+    "test_refinement.py",
+    "test_development.py",
 )
 
 
