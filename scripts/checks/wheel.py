@@ -3,8 +3,8 @@
     python scripts/checks/wheel.py
 
 Builds the wheel, unpacks it into an empty folder, and there trains, lists, evaluates and reports a small run, acts with
-an agent of the package in a Gymnasium loop of three lines, and draws it where pictures can be drawn. Dependencies are
-those of the Python that runs this. Root does all of it as another user who may run this Python; with none, and for
+an agent of the package in a Gymnasium loop of three lines, and draws a task where pictures can be drawn. Dependencies
+are those of the Python that runs this. Root does all of it as another user who may run this Python; with none, and for
 anybody else, only the home is another. Ends with code 1 at the first failure.
 """
 
@@ -34,7 +34,7 @@ obs, info = env.reset(seed=0)
 for _ in range(20): obs, *_ = env.step(agent.act(obs))
 print(star.__file__, obs["achieved_goal"])
 """
-DRAW = "render --agent point_maze --out film.gif --steps 10 --every 5 --height 120 --quiet"
+DRAW = "render ant_maze --out film.gif --steps 10 --every 5 --height 120 --quiet"
 
 
 def main() -> None:
@@ -68,7 +68,7 @@ class Newcomer:
         self._work = work
         named = ("PATH", "LANG", "MUJOCO_GL", "JAX_", "XLA_")
         self._environment = {k: v for k, v in os.environ.items() if k.startswith(named)}
-        self._environment |= {"PYTHONPATH": str(site), "HOME": str(work), "PYTHONDONTWRITEBYTECODE": "1"}
+        self._environment |= {"PYTHONPATH": str(site), "HOME": str(work)}
         self._who = another() if os.geteuid() == 0 else {}
         print("as another user" if self._who else "as this user, in another home")
 

@@ -29,6 +29,9 @@ def settings(**values):
 
 
 CONFIG = settings()
+EAGER = settings(
+    **{"refinement.miss_lifetime": 0, "refinement.cuts_per_pair": 2, "refinement.neighbours": False}
+)  # compiled once for what each of them changes
 
 
 def grid(cuts=((8.0,), (8.0,))):
@@ -304,9 +307,9 @@ def test_the_parts_get_verdicts_and_a_miss_is_examined_again_after_its_lifetime(
 
 
 def test_misses_without_a_lifetime_are_not_recorded(refine, moving):
-    config, model, graph = settings(**{"refinement.miss_lifetime": 0}), moving((-6, 0)), knowing((0, 2))
+    model, graph = moving((-6, 0)), knowing((0, 2))
     assert int(refine(CONFIG, grid(), graph, model)[1].verdict[0, 2]) == MISSES
-    _, graph, _, metrics = refine(config, grid(), graph, model)
+    _, graph, _, metrics = refine(EAGER, grid(), graph, model)
     assert int(metrics["examined"]) == 1 and int(graph.verdict[0, 2]) == UNKNOWN
 
 
@@ -407,8 +410,7 @@ def test_a_region_is_cut_besides_where_nobody_passes_and_the_graph_follows(refin
 
 def test_an_examined_pair_may_make_several_cuts(refine, moving):
     # +6 along both axes: only the upper right quarter of region 0 reaches region 3, which takes two cuts to part.
-    chosen = settings(**{"refinement.cuts_per_pair": 2, "refinement.neighbours": False})
-    abstraction, _, splits, _ = refine(chosen, grid(), knowing((0, 3)), moving((6, 6)))
+    abstraction, _, splits, _ = refine(EAGER, grid(), knowing((0, 3)), moving((6, 6)))
     assert splits.done.tolist() == [True, True]
     corners = np.concatenate([abstraction.lower, abstraction.upper], axis=1)
     assert [2, 2, 8, 8] in corners.tolist()

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import gymnasium
@@ -37,6 +38,7 @@ def rested(agent):
     agent.reset()
 
 
+@cache
 def evaluated(run, episodes):
     """Observations and actions [seeds, env steps, episodes, ...] of `star evaluate`."""
     program = programs.build(load_to_act(run, {}))
@@ -208,6 +210,7 @@ def test_no_run_is_told_in_one_line(tmp_path):
             function(tmp_path / "new")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_training_and_evaluating_return_what_the_commands_print(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     result = star.train(ALONE, {"trainer.total_env_steps": 480})

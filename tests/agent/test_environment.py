@@ -49,6 +49,7 @@ def forget(monkeypatch):
         sys.modules.pop(module, None)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_it_trains_and_resumes_bit_for_bit_where_it_is_trusted(here, monkeypatch, capsys):
     train = ["train", "run.yaml", "--import", "room", "--trainer.checkpoint_every", "1", "--quiet"]
     assert main([*train, "--run-dir", "whole"]) == 0

@@ -345,11 +345,14 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
         region, jnp.array([target, 0]), jnp.array([target, 0]), ones, region, ones, *[0 * ones] * 3, goal=goal
     )
     outcome = Outcome(start=start, lower=start, upper=start, end=end, weight=ones)
-    known = state.commander
-    learnt = jax.jit(commander.follow)(
-        config.commander, known, change, known, Finished(decision, outcome), jnp.zeros_like(known.q[0])
-    )
+    known, follow = state.commander, jax.jit(commander.follow)
+    of_epoch = Finished(decision, outcome), jnp.zeros_like(known.q[0])
+    learnt = follow(config.commander, known, change, known, *of_epoch)
     np.testing.assert_array_equal(learnt.q, expected)
+    without = known.replace(model=None)
+    by_values = follow(config.commander.model_copy(update={"learner": "q"}), without, change, without, *of_epoch)
+    np.testing.assert_array_equal(by_values.q, expected)
+    assert by_values.model is None
     assert float(learnt.chosen[0]) == float(learnt.chosen[count]) == 0.5
     led = np.argwhere(np.asarray(learnt.model.led))
     assert led.tolist() == [[1, 0, target, count], [1, count, count, 0]]
@@ -371,13 +374,6 @@ REPLAY = {"hidden": [8], "batch_size": 16, "buffer_size": 64, "min_transitions":
 
 
 @pytest.fixture(scope="module")
-def gara(breaking_env, tiny):
-    """Its regions stay as they are: refinement never asks who is there."""
-    values = loading.parse(tiny, {"tutor.enabled": False, "refinement.enabled": False})
-    return Epoch(breaking_env, values.model_dump(mode="json"))
-
-
-@pytest.fixture(scope="module")
 def hrac(breaking_env, turning, tiny):
     """HIRO, which replays and corrects old subgoals, with a loss more; its subgoals set a heading too."""
     replaying = {"tutor.learner": "td3", "tutor.off_policy_correction": True, "tutor.td3": REPLAY}
@@ -385,21 +381,17 @@ def hrac(breaking_env, turning, tiny):
     return Epoch(breaking_env, values.model_dump(mode="json"), turning)
 
 
-@pytest.mark.parametrize("name", ["gara", "hrac"])
-def test_levels_can_be_left_out(request, name):
-    """Both levels are left out in `test_trainer.py`."""
-    agent = request.getfixturevalue(name)
-    start = agent.init(jax.random.key(0))
-    end, metrics = agent.one(agent.config.hyper(), start)
+def test_the_commander_can_be_left_out(hrac):
+    """In `test_trainer.py` both upper levels are, and in `test_development.py` the Tutor."""
+    start = hrac.init(jax.random.key(0))
+    end, metrics = hrac.one(hrac.config.hyper(), start)
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), start, end)
     assert any(jax.tree.leaves(moved.controller.params))
-    assert (end.tutor is None) == ("tutor/q" not in metrics) == (name == "gara")
-    if name == "hrac":
-        assert int(end.tutor.updates) == 2 * (agent.spec.episode_length // (2 * L) - 1)  # not of the first 16 decisions
-        assert all(any(jax.tree.leaves(moved.tutor.params[part])) for part in ("actor", "critic"))
-    assert ("abstraction/regions" in metrics) == (name == "gara")
-    assert bool(end.commander.chosen.any()) == (name == "gara")
-    assert (end.adjacency is not None and bool(end.adjacency.adjacent.any())) == (name == "hrac")
+    assert "tutor/q" in metrics
+    assert int(end.tutor.updates) == 2 * (hrac.spec.episode_length // (2 * L) - 1)  # not of the first 16 decisions
+    assert all(any(jax.tree.leaves(moved.tutor.params[part])) for part in ("actor", "critic"))
+    assert "abstraction/regions" not in metrics and not end.commander.chosen.any()
+    assert bool(end.adjacency.adjacent.any())
 
 
 @pytest.mark.parametrize("tutored", [True, False])

@@ -5,11 +5,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-pytest.importorskip("stable_baselines3")
-
-import torch  # noqa: E402
-from stable_baselines3.common import env_checker  # noqa: E402
-
 PAGE = Path(__file__).parents[2] / "docs" / "gymnasium.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
 EPISODES = 40
@@ -17,7 +12,13 @@ EPISODES = 40
 
 @pytest.fixture(scope="module")
 def trained():
-    """What the page's example leaves behind: an environment and a model trained with hindsight."""
+    """What the page's example leaves behind: an environment and a model trained with hindsight.
+
+    PyTorch takes seconds to import, which only the process that runs these tests needs.
+    """
+    pytest.importorskip("stable_baselines3")
+    import torch
+
     torch.set_num_threads(1)
     (example,) = (text for text in EXAMPLES if "stable_baselines3" in text)
     names: dict = {}
@@ -56,4 +57,6 @@ def test_relabelled_rewards_are_those_of_compute_reward(trained):
 
 
 def test_the_checker_of_stable_baselines_passes(trained):
+    from stable_baselines3.common import env_checker
+
     env_checker.check_env(trained.env.unwrapped)

@@ -38,6 +38,7 @@ def forget(monkeypatch):
     sys.modules.pop("mine", None)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_it_trains_checkpoints_and_resumes_bit_for_bit(here, monkeypatch, capsys):
     assert len((here / "mine.py").read_text().splitlines()) < 50
     train = [
