@@ -23,6 +23,6 @@ def save(figure: Figure, name: str, *, dpi: int, of: str = "") -> None:
 
 
 def shown(name: str) -> str:
-    """What the chart `name` was said to show."""
+    """The `of` with which the chart `name` was saved."""
     with Image.open(IMAGES / f"{name}.png") as chart:
         return str(chart.info["of"])

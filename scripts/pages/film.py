@@ -42,7 +42,7 @@ def until_arrived(recording: films.Recording) -> films.Recording:
 
 
 def ending(path: Path = FILM) -> dict[str, Any]:
-    """What the film says of its last picture: agent, seconds, distance to the goal (m), and success."""
+    """The film's words about its last picture: agent, seconds, distance to the goal (m), and success."""
     with Image.open(path) as film:
         return dict(json.loads(film.info["comment"]))
 

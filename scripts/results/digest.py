@@ -47,7 +47,7 @@ def of(command: str) -> dict[str, Any]:
 
 
 def same(one: Digest | None, other: Digest | None) -> bool:
-    """Whether both are digests of one way of learning."""
+    """True if both are digests of one way of learning."""
     if not one or not other or one["settings"] != other["settings"] or one["moved"].keys() != other["moved"].keys():
         return False
     return all(abs(one["moved"][part] - other["moved"][part]) <= CLOSE for part in one["moved"])
@@ -93,7 +93,7 @@ def moved(begun: Any, ended: Any) -> dict[str, float]:
 
 
 def _find(values: Any, key: str) -> Any:
-    """What stands in nested `values` below a dotted key; None if there is no such place."""
+    """The value in nested `values` below a dotted key; None if there is no such place."""
     for name in key.split("."):
         if not isinstance(values, dict) or name not in values:
             return None

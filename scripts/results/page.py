@@ -33,7 +33,7 @@ DIGESTS = RESULTS / "digests.json"
 BEGIN, END = "<!-- made by scripts/results/page.py -->", "<!-- made until here -->"
 MARK = "†"
 
-# What a task is called, the row that answers for it, and the published success (arXiv 2401.09870).
+# The name of a task, the row that answers for it, and the published success (arXiv 2401.09870).
 TASKS = (
     ("Ant Maze", "ant_maze/one_by_one/star", ".84"),
     ("Ant Maze Cam", "ant_maze_cam/one_by_one/star", ".74"),
@@ -83,7 +83,7 @@ class Row(NamedTuple):
 
     @property
     def mark(self) -> str:
-        """What stands behind the name of a row of an older version."""
+        """The mark behind the name of a row of an older version."""
         return "" if self.today else f" {MARK}"
 
 
@@ -222,7 +222,7 @@ Curves are means over seeds; bands hold all seeds. In the labyrinth STAR pays fo
 
 ![Success with and without refinement in six mazes](images/results_refinement.png)
 
-The last pair starts from four boxes that follow no wall. Where the first boxes follow the walls, refinement changes
+The last pair starts from four boxes that follow no wall. If the first boxes follow the walls, refinement changes
 [nothing](notebook/results.md#what-each-part-is-worth).
 
 ![Success in the labyrinth as parts of STAR are left out](images/results_parts.png)

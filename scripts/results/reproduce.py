@@ -108,7 +108,7 @@ def measure(
 def summarise(
     task: str, name: str, old: dict[str, Any], measured: dict[str, Any], *, level: float
 ) -> tuple[dict[str, Any], list]:
-    """What goes into an agent's JSON, the seeds of the `old` one included, and the new evaluations during training."""
+    """The content of an agent's JSON, the seeds of the `old` one included, and the new evaluations during training."""
     rows = measured["rows"]
     curve = [
         {"name": name} | {k: v for k, v in row.items() if k in CURVE or k.startswith("sgim/")}
@@ -248,7 +248,7 @@ def again(row: str) -> list[str]:
 
 
 def _told_by_us(words: list[str], place: int) -> bool:
-    """Whether the word of a command at `place` is the config, or a layer, or says which seeds."""
+    """True if the word of a command at `place` is the config, or a layer, or says which seeds."""
     ours = ("--with", "--seed", "--seeds")
     return place == 0 or words[place] in ours or words[place - 1] in ours
 
