@@ -420,6 +420,12 @@ def test_the_citation_names_the_paper_of_the_readme():
     assert cited["version"] == built["project"]["version"] and cited["license"] == built["project"]["license"]
 
 
+def test_the_pictures_of_the_pages_are_used_and_small():
+    images = sorted((ROOT / "docs" / "images").iterdir())
+    assert sum(image.stat().st_size for image in images) < 2_000_000
+    assert [image.name for image in images if not any(f"images/{image.name})" in text for text in PAGES.values())] == []
+
+
 def test_the_film_ends_on_the_goal():
     told = load_script("pages/film").ending()
     assert told["success"] and told["distance"] < 5 and PAGES["README.md"].count("film.gif") == 1

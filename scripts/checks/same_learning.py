@@ -152,6 +152,7 @@ ROWS: dict[str, Row] = {
     "ablations/td3_tutor": Row(settings=POINT | SMALL_TD3),
     "ablations/td3_uncorrected": Row(settings=POINT | SMALL_TD3),
     "ablations/world_frame": Row("ant_maze_cpu", ANT),
+    "ablations/wrong_boxes": Row(),
     "sgim/all": Row(),
     "sgim/exploration": Row(),
     "sgim/goals": Row(),

@@ -216,7 +216,7 @@ Older figures of HIRO are in the [notebook](notebook/results.md#hiro-and-hrac-an
 ![Success of STAR and GARA over env steps](images/results_curves.png)
 
 Curves are means over seeds; bands hold all seeds. In the labyrinth STAR pays for
-[tilts](departures.md#tutor-and-controller) and GARA does not, as GARA is better so.
+[tilts](notebook/departures.md#tutor-and-controller) and GARA does not, as GARA is better so.
 
 ## Worth of refinement
 
