@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from envs.common.errors import UserError
 from star.agent import figures, films
@@ -27,7 +28,7 @@ NAMES = ("refined", "not refined")
 
 
 class Shown(NamedTuple):
-    """The drawn parts of a run: evaluations, the last regions of its first seed, walls [n, 4], a greedy way [T, 2] (m)."""
+    """The drawn parts of a run: evaluations, last regions of its first seed, walls [n, 4], greedy way [T, 2] (m)."""
 
     rows: list[dict[str, Any]]
     regions: dict[str, Any]
@@ -74,7 +75,8 @@ def figure(runs: list[Shown]) -> Figure:
     curves.set(xlabel="env steps of each seed", ylabel="success on the test goal", ylim=(-0.02, 1.02))
     curves.set_title(f"success: mean and range of {seeds} seed{'s' * (seeds > 1)}")
     curves.grid(alpha=0.3)
-    curves.legend(loc="center right")
+    curves.xaxis.set_major_formatter(EngFormatter(sep=""))  # 200k
+    curves.legend(loc="best")
     return drawn
 
 
