@@ -429,3 +429,31 @@ def test_the_pictures_of_the_pages_are_used_and_small():
 def test_the_film_ends_on_the_goal():
     told = load_script("pages/film").ending()
     assert told["success"] and told["distance"] < 5 and PAGES["README.md"].count("film.gif") == 1
+
+
+FOR_A_GPU = {path.stem for path in ROOT.glob("configs/*.yaml") if "NVIDIA GPU" in path.read_text().splitlines()[0]}
+FOR_A_GPU |= {"paper/many"}
+SHELL = [
+    (page, line) for page in PAGES for block in blocks(page, "bash") for line in block.replace("\\\n", " ").splitlines()
+]
+
+
+def wants_a_gpu(words):
+    """Whether a command line trains on a config that is made for a GPU."""
+    names = {re.sub(r"^configs/|\.yaml$", "", word).split("/one_by_one")[0] for word in words}
+    trains = words[1:2] == ["train"] or words[0] == "python"
+    return trains and bool(names & FOR_A_GPU) and not {"--dry-run", "native"} & set(words)
+
+
+@pytest.mark.parametrize(("page", "line"), [one for one in SHELL if re.match(r"star |python ", one[1])])
+def test_a_command_that_wants_a_gpu_carries_its_mark(page, line):
+    command, _, comment = line.partition(" #")
+    assert not wants_a_gpu(shlex.split(command)) or "GPU" in comment, f"{page}: add # GPU to: {line}"
+
+
+def test_commands_for_a_gpu_are_told_from_others():
+    assert wants_a_gpu(["star", "train", "ant_maze"]) and wants_a_gpu(
+        ["star", "train", "configs/ant_fall.yaml", "--seeds", "5"]
+    )
+    assert not wants_a_gpu(["star", "train", "ant_maze_cpu"]) and not wants_a_gpu(["star", "render", "ant_maze"])
+    assert not wants_a_gpu(["star", "train", "ant_maze", "--dry-run"]) and wants_a_gpu(["python", "x.py", "ant_maze"])

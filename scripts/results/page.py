@@ -237,7 +237,7 @@ students](tutoring.md) have their figures on their own pages.
 ## Measure a row again
 
 ```bash
-python scripts/results/reproduce.py ant_maze/one_by_one/star ant_labyrinth/gara
+python scripts/results/reproduce.py ant_maze/one_by_one/star ant_labyrinth/gara  # GPU
 python scripts/results/page.py --digests
 ```
 
