@@ -2,13 +2,15 @@
 
     state = qpos[0:15], qvel[0:14], t * .001      t in env steps
     start = qpos0 + U(-.1, .1), N(0, .1^2)        qpos0 has the torso .75 above the floor and every joint at 0
+                                                  of model `jaxgcrl` .55, ankles bent by 1 rad, x and y without noise
 
 qpos is x, y, z in m, a unit quaternion (w, x, y, z), then hip and ankle of legs 1 to 4 in rad; qvel is the velocity
 of the torso in m/s (world frame), its angular velocity in rad/s (body frame), then the 8 joint velocities. Actions
 follow the order of the joints, 1 standing for 30 N m.
 
-Other parts of the task are hidden from this state. The full one appends, for each block, how far it has
-slid along each of its axes and how fast, then 1 for each gate that is open.
+With `untimed` the last number, the clock, is left out. Other parts of the task are hidden from this state.
+The full one appends, for each block, how far it has slid along each of its axes and how fast, then 1 for each gate
+that is open.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from envs import scene
 from envs.arena import BLOCK, HEIGHT
 from envs.maze import uprightness, yaw
 from envs.physics import Physics, PhysicsState
-from envs.tasks import PRESETS, Switch, Task
+from envs.tasks import Switch, Task
 
 MAX_TORQUE = 30.0  # N m
 START_POSITION = 0.1  # half-range of the start qpos, m and rad
@@ -35,6 +37,9 @@ STEP_SCALE = 0.001  # of the step count in the state
 ORIENTATION = (3, 4, 5, 6)  # indices of the quaternion in qpos and in the state
 VELOCITY = (15, 16)  # those in the state of the torso's velocity along x and y
 QPOS, QVEL = 15, 14  # the ant's own positions and velocities; those of blocks follow
+HEALTHY = (0.2, 1.0)  # height of the torso above the floor, m
+BENT = (0.55, (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0))  # JaxGCRL's start: that height (m), and the joints (rad)
+MUJOCO_SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 ON_ITS_BACK = -0.5  # the ant is flipped when the vertical part of its own up axis is below
 LIFT = 2 * HEIGHT  # how far an open gate is lifted, m
 
@@ -47,8 +52,12 @@ SOLVERS = {"newton": mujoco.mjtSolver.mjSOL_NEWTON, "cg": mujoco.mjtSolver.mjSOL
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 
 
-def spec(*, action_scale: float = 1.0, collisions: str = "all") -> mujoco.MjSpec:
-    """The ant's own model, without floor or walls. With `collisions="feet"` only torso and shins touch anything."""
+def spec(*, action_scale: float = 1.0, collisions: str = "all", model: str = "published") -> mujoco.MjSpec:
+    """The ant's own model, without floor or walls. With `collisions="feet"` only torso and shins touch anything.
+
+    `model="jaxgcrl"` has feet, which touch the floor, walls, torso and each other; torso and hips touch walls and feet
+    alone. Contacts have MuJoCo's own parameters, and joints are not damped implicitly.
+    """
     xml = resources.files("envs").joinpath("assets", "ant.xml").read_text(encoding="utf-8")
     ant = mujoco.MjSpec.from_string(xml)
     for motor in ant.actuators:
@@ -56,30 +65,60 @@ def spec(*, action_scale: float = 1.0, collisions: str = "all") -> mujoco.MjSpec
     for geom in ant.geoms:
         if collisions == "feet" and not geom.name.startswith(("torso", "shin")):
             geom.contype = 0
+    if model == "jaxgcrl":
+        _as_in_jaxgcrl(ant)
     return ant
+
+
+def _as_in_jaxgcrl(ant: mujoco.MjSpec) -> None:
+    """Turn the ant into that of JaxGCRL, but for the order of its motors."""
+    ant.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    ant.default.geom.solimp = MUJOCO_SOLIMP  # of floor and walls
+    for geom in ant.geoms:
+        touching = geom.name.startswith(("torso", "hip"))
+        geom.contype, geom.conaffinity = (scene.TORSO, 1) if touching else (0, 0)
+        geom.solimp = MUJOCO_SOLIMP
+    for leg, (x, y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1)), start=1):
+        ant.body(f"shin_{leg}").add_geom(
+            name=f"foot_{leg}",
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=[0.4 * x, 0.4 * y, 0.0],
+            size=[0.08, 0.0, 0.0],
+            mass=0.0,
+            contype=1,
+            conaffinity=1,
+        )
 
 
 def build(task: Task, engine: str, options: Mapping[str, Any]) -> Ant:
     """The ant in the arena of `task`; raises `EnvError` if the engine cannot run here."""
-    given = {key: value for key, value in options.items() if value is not None}
-    chosen = {**PRESETS[options["preset"]], **given}
     solver = {
-        "timestep": chosen["timestep"],
-        "integrator": INTEGRATORS[chosen["integrator"]],
-        "solver": SOLVERS[chosen["solver"]],
-        "cone": CONES[chosen["cone"]],
-        "iterations": chosen["iterations"],
-        "ls_iterations": chosen["ls_iterations"],
+        "timestep": options["timestep"],
+        "integrator": INTEGRATORS[options["integrator"]],
+        "solver": SOLVERS[options["solver"]],
+        "cone": CONES[options["cone"]],
+        "iterations": options["iterations"],
+        "ls_iterations": options["ls_iterations"],
     }
-    body = spec(action_scale=chosen["action_scale"], collisions=chosen["collisions"])
-    physics = Physics(scene.build_model(task.arena, body, solver), engine=engine, frames=chosen["frames"])
-    return Ant(physics, task, action_scale=chosen["action_scale"], full=chosen["observe"] == "full")
+    own = {key: options[key] for key in ("action_scale", "collisions", "model")}
+    model = scene.build_model(task.arena, spec(**own), solver, margin=options["margin"])
+    physics = Physics(model, engine=engine, frames=options["frames"])
+    return Ant(physics, task, **own, observed=options["observe"])
 
 
 class Ant:
-    """The body for `MazeEnv`: state of 30, more if `full`; 8 actions."""
+    """The body for `MazeEnv`: state of 30, of 29 if `observed` is `untimed`, of more if it is `full`; 8 actions."""
 
-    def __init__(self, physics: Physics, task: Task, *, action_scale: float = 1.0, full: bool = False):
+    def __init__(
+        self,
+        physics: Physics,
+        task: Task,
+        *,
+        action_scale: float = 1.0,
+        collisions: str = "all",
+        model: str = "published",
+        observed: str = "published",
+    ):
         """Live in the model of `physics`, whose first 15 qpos, 14 qvel and 8 controls are the ant's."""
         self.physics = physics
         self.action_size = physics.model.nu
@@ -89,15 +128,20 @@ class Ant:
         self._arena = task.arena
         self._switch: Switch | None = task.switch
         self._block_noise = task.block_noise
-        self._full = full
+        self._own = (collisions, model)
+        self._observed = observed
         self._max_torque = MAX_TORQUE * action_scale
         self._closed = np.asarray(physics.mocap_pos)
         self._blocks = len(task.arena.centres(BLOCK))
         start = np.array(physics.model.qpos0)
+        self._shake = np.full(QPOS, START_POSITION, np.float32)
+        if model == "jaxgcrl":
+            start[2], start[7:QPOS] = BENT
+            self._shake[:2] = 0.0
         start[2] += task.arena.floor_height
         self._start = start.astype(np.float32)
         slides = 2 * (len(start) - QPOS)
-        self.state_dim = QPOS + QVEL + 1 + (slides + len(self._closed)) * full
+        self.state_dim = QPOS + QVEL + (observed != "untimed") + (slides + len(self._closed)) * (observed == "full")
 
     @property
     def engine(self) -> str:
@@ -107,7 +151,7 @@ class Ant:
     def init(self, rng: jax.Array, position: jax.Array) -> PhysicsState:
         """A noisy start at `position` [2]."""
         qpos_rng, qvel_rng, block_rng = jax.random.split(rng, 3)
-        noise = jax.random.uniform(qpos_rng, (QPOS,), minval=-START_POSITION, maxval=START_POSITION)
+        noise = self._shake * jax.random.uniform(qpos_rng, (QPOS,), minval=-1.0, maxval=1.0)
         qpos = jnp.asarray(self._start).at[:QPOS].add(noise).at[:2].add(position)
         qpos = qpos.at[3:7].divide(jnp.linalg.norm(qpos[3:7]))
         if self._block_noise:
@@ -127,9 +171,10 @@ class Ant:
     def observe(self, data: PhysicsState, steps: jax.Array) -> jax.Array:
         """The state [state_dim]."""
         clock = STEP_SCALE * steps.astype(jnp.float32)
-        published = [data.qpos[:QPOS], data.qvel[:QVEL], clock[None]]
+        moving = [data.qpos[:QPOS], data.qvel[:QVEL]]
         hidden = [data.qpos[QPOS:], data.qvel[QVEL:], self._is_open(data).astype(jnp.float32)]
-        return jnp.concatenate(published + hidden if self._full else published)
+        rest = {"published": [clock[None]], "full": [clock[None], *hidden], "untimed": []}
+        return jnp.concatenate(moving + rest[self._observed])
 
     def displace(self, data: PhysicsState, offset: jax.Array) -> PhysicsState:
         """The ant moved by `offset` [2]; the solver corrects what gets into a wall."""
@@ -143,13 +188,18 @@ class Ant:
         """True if the torso is below half the height of the floor."""
         return data.qpos[2] < self._arena.floor_height / 2
 
+    def unhealthy(self, data: PhysicsState) -> jax.Array:
+        """True if the torso is less than .2 m or more than 1 m above the floor."""
+        height, (low, high) = data.qpos[2] - self._arena.floor_height, HEALTHY
+        return (height < low) | (height > high)
+
     def dropped(self, data: PhysicsState) -> jax.Array:
         """True if MJX-Warp ran out of room for contacts."""
         return data.overflow > 0
 
     def model(self) -> mujoco.MjModel:
         """The model with a checkered floor."""
-        return scene.build_model(self._arena, spec(), {}, visual=True)
+        return scene.build_model(self._arena, spec(collisions=self._own[0], model=self._own[1]), {}, visual=True)
 
     def pose(self, data: PhysicsState) -> tuple[jax.Array, jax.Array]:
         """(qpos, mocap_pos)."""

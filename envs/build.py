@@ -9,7 +9,7 @@ from envs import ant, point, tasks
 from envs.common import modes
 from envs.maze import Body, MazeEnv
 from envs.options import EnvError, known, normal, resolve
-from envs.tasks import TASKS, Task
+from envs.tasks import PRESETS, TASKS, Task
 
 BODIES: Mapping[str, Callable[[Task, str, Mapping[str, Any]], Body]] = {"ant": ant.build, "point": point.build}
 
@@ -33,7 +33,10 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
     if engine not in task.engines:
         raise EnvError(f'engine "{engine}" is not one of {name}; {known(engine, task.engines)}')
     options = normal(options)
-    chosen = resolve(name, task.options(), options)
+    table = task.options()
+    chosen = resolve(name, table, options)
+    if "preset" in chosen:
+        chosen = resolve(name, table, {**PRESETS[chosen["preset"]], **options})
     if chosen.get("map") is not None:
         task = tasks.own(task.body, chosen["map"], cell=chosen["cell"])
         for key, sets in (("goals", task.goals), ("start", task.starts)):
@@ -53,5 +56,6 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
         success_radius=task.success_radius if radius is None else radius,
         flip=chosen["flip"],
         fall=chosen["fall"],
+        unhealthy=chosen["unhealthy"],
         position_noise=chosen["position_noise"],
     )

@@ -34,7 +34,7 @@ Corner = Sequence[float]
 
 DRAWN = ("model", "pose", "arena")  # what pictures need
 TRIED = 64  # episodes that are begun to see what goals they have
-ZEROS = ("non_finite", "overflow", "flipped", "fallen")  # metrics that an environment need not have
+ZEROS = ("non_finite", "overflow", "flipped", "fallen", "unhealthy")  # metrics that an environment need not have
 
 
 class GoalEnv(Protocol):

@@ -6,7 +6,7 @@
 
 An episode is truncated after `episode_length` steps, and at once if the simulator fails: a state that is not finite,
 contacts that were dropped. The observation then stays what it was. With `flip` it also ends when the body turns over,
-with `fall` when it lies in a gap.
+with `fall` when it lies in a gap, with `unhealthy` when it is too low or too high.
 An episode that has ended before its time stays as it is until the next reset.
 """
 
@@ -63,6 +63,9 @@ class Body(Protocol):
     def fallen(self, data: Any) -> jax.Array:
         """True if the body is down in a gap of the floor (bool)."""
 
+    def unhealthy(self, data: Any) -> jax.Array:
+        """True if the body is lower or higher than it can walk (bool)."""
+
     def dropped(self, data: Any) -> jax.Array:
         """True if the engine dropped contacts in the last step (bool)."""
 
@@ -105,6 +108,7 @@ class MazeEnv(Env):
         success_radius: float,
         flip: str = "ignore",
         fall: str = "ignore",
+        unhealthy: str = "ignore",
         position_noise: float = 0.0,
     ):
         """`task` is a row of the registry; the other arguments are options of docs/environments.md."""
@@ -127,7 +131,7 @@ class MazeEnv(Env):
         self._goals = task.goals[goals]
         self._starts = task.starts[start]
         self._sparse = reward == "sparse"
-        self._ends = {"flipped": flip, "fallen": fall}
+        self._ends = {"flipped": flip, "fallen": fall, "unhealthy": unhealthy}
         self._position_noise = position_noise
 
     @classmethod

@@ -99,6 +99,10 @@ class Point:
         """Never."""
         return jnp.zeros((), bool)
 
+    def unhealthy(self, data: PointState) -> jax.Array:
+        """Never."""
+        return jnp.zeros((), bool)
+
     def dropped(self, data: PointState) -> jax.Array:
         """Never."""
         return jnp.zeros((), bool)

@@ -119,6 +119,10 @@ class Robot:
             return jnp.zeros((), bool)
         return data.qpos[2] < self.arena.floor_height / 2
 
+    def unhealthy(self, data: PhysicsState) -> jax.Array:
+        """Never; nobody says how high it stands."""
+        return jnp.zeros((), bool)
+
     def dropped(self, data: PhysicsState) -> jax.Array:
         """True if MJX-Warp ran out of room for contacts."""
         return data.overflow > 0

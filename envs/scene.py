@@ -6,9 +6,10 @@
             the ant meets its box, floor and walls meet spheres in its four lower corners
     gate    a mocap body, lifted out of the way by whoever steps the model
 
-Geoms that stand still have contype 0 and conaffinity 1, so that they never meet each other. All take the contact
-parameters of the body's default class, but for margins: contacts with the plane begin 1 cm above it, those with boxes
-where they touch, since that is where MJX begins them between capsule and box.
+Geoms that stand still have contype 0 and conaffinity 1, so that they never meet each other. Walls and gates also meet
+contype 2, for a torso that the floor lets through. All take the contact parameters of the body's default class, but
+for margins: contacts with the plane begin `margin` above it, those with boxes where they touch, since that is where
+MJX begins them between capsule and box.
 
 Boxes of 8 m that lie on each other are missed now and then by MJX-Warp, spheres on boxes are not. Since no wall is
 narrower than a block, its corners meet all that it would meet. A block that falls begins a tenth of a millimetre
@@ -40,11 +41,20 @@ BLOCK_CLEAR = 2 * PLANE_MARGIN
 # by .5 m when the ant pushes it to the end of its way.
 BLOCK_SOLIMP = (0.99, 0.999, 0.001)
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+TORSO = 2  # contype of a torso that touches walls and no floor
 STATIC: dict[str, Any] = {"contype": 0, "conaffinity": 1}
+UPRIGHT: dict[str, Any] = {"contype": 0, "conaffinity": 1 | TORSO}  # walls and gates
 
 
-def build_model(arena: Arena, body: mujoco.MjSpec, options: Mapping[str, Any], *, visual: bool = False) -> Any:
-    """The `MjModel` of `body` in `arena`. `options` are attributes of `MjSpec.option`.
+def build_model(
+    arena: Arena,
+    body: mujoco.MjSpec,
+    options: Mapping[str, Any],
+    *,
+    margin: float = PLANE_MARGIN,
+    visual: bool = False,
+) -> Any:
+    """The `MjModel` of `body` in `arena`. `options` are attributes of `MjSpec.option`, `margin` is the plane's (m).
 
     The joints of `body` come first, then the slides of the blocks in the order of x, y, z. With `visual` the floor
     has a checkered texture and the walls of small cells are lower; places and joints are the same.
@@ -61,7 +71,7 @@ def build_model(arena: Arena, body: mujoco.MjSpec, options: Mapping[str, Any], *
         pos=[*middle, 0.0],
         size=[*half, 0.1],
         rgba=FLOOR_COLOUR,
-        margin=PLANE_MARGIN,
+        margin=margin,
         **STATIC,
     )
     floors = [
@@ -88,7 +98,7 @@ def _box(parent: Any, name: str, rectangle: np.ndarray, low: float, high: float,
         pos=[*(rectangle[:2] + rectangle[2:]) / 2, (low + high) / 2],
         size=[*(rectangle[2:] - rectangle[:2]) / 2, (high - low) / 2],
         rgba=colour,
-        **STATIC,
+        **UPRIGHT,
     )
 
 
@@ -135,7 +145,7 @@ def _add_block(world: Any, name: str, centre: np.ndarray, arena: Arena) -> None:
 def _add_gate(world: Any, name: str, rectangle: np.ndarray, arena: Arena) -> None:
     centre, half = (rectangle[:2] + rectangle[2:]) / 2, (rectangle[2:] - rectangle[:2]) / 2
     body = world.add_body(name=name, mocap=True, pos=[*centre, arena.floor_height + HEIGHT / 2])
-    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, HEIGHT / 2], rgba=GATE_COLOUR, **STATIC)
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, HEIGHT / 2], rgba=GATE_COLOUR, **UPRIGHT)
 
 
 def _checker(spec: mujoco.MjSpec, floors: list[Any], *, cell: float) -> None:

@@ -24,10 +24,23 @@ ENDS = ("ignore", "terminate", "truncate")  # what a mishap may do to the episod
 CLEARANCE = {"ant": 1.0, "point": 0.6}  # m that a body keeps from the sides of a cell when it starts anywhere
 
 # `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
-# MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both.
+# MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both. `jaxgcrl` is the
+# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025).
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 10},
     "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},
+    "jaxgcrl": {
+        "model": "jaxgcrl",
+        "integrator": "euler",
+        "iterations": 1,
+        "ls_iterations": 4,
+        "timestep": 0.01,
+        "margin": 0.0,
+        "action_scale": 5.0,
+        "observe": "untimed",
+        "unhealthy": "terminate",
+        "episode_length": 1000,
+    },
 }
 
 
@@ -81,6 +94,7 @@ class Task:
     `goals` names the distributions of the desired goal, the first being the default; `starts` those of the body's
     position (x, y). `block_noise` is the standard deviation, in m, of a block's start along x. `defaults` are
     options whose default is not the usual one, `maps` tells whether a map of the user's own may take the row's place.
+    `presets` are those of an ant.
     `clearance` is what the body keeps from the sides of a cell where it may start anywhere, in m.
     """
 
@@ -95,6 +109,7 @@ class Task:
     block_noise: float = 0.0
     defaults: Mapping[str, Any] = field(default_factory=dict)
     maps: bool = False
+    presets: tuple[str, ...] = ("fast", "published")
 
     def resized(self, cell: float) -> Task:
         """The task with cells of `cell` m; heights stay."""
@@ -126,7 +141,7 @@ class Task:
         if self.maps:
             options["map"] = MAP
         if self.body == "ant":
-            options |= ANT
+            options |= {**ANT, "preset": choice(*self.presets)}
         return options | {key: replace(options[key], default=value) for key, value in self.defaults.items()}
 
 
@@ -142,11 +157,14 @@ COMMON: Mapping[str, Option] = {
     "position_noise": number(0.0, 0.0, 1.0, "m"),
     "flip": choice(*ENDS),
     "fall": choice(*ENDS),
+    "unhealthy": choice(*ENDS),
 }
 
 ANT: Mapping[str, Option] = {
-    "preset": choice(*PRESETS),
+    "observe": choice("published", "full", "untimed"),
+    "model": choice("published", "jaxgcrl"),
     "collisions": choice("all", "feet"),
+    "margin": number(0.01, 0.0, 0.1, "m"),
     "timestep": duration(0.02, 1.0),
     "frames": count(5, 1000),
     "solver": choice(*SOLVERS),
@@ -309,9 +327,18 @@ def _transposed(*rows: str) -> tuple[str, ...]:
 
 
 # JaxGCRL's mazes, whose first index is x: 4 m cells, success within .5 m, goals at the centres of the cells `g`.
+# U4 and U5 are of a later paper with its environments (Wang et al. 2025).
 
 U_MAZE = Arena(_transposed("11111", "1rgg1", "111g1", "1ggg1", "11111"), cell=4.0)
 U_MAZE_TEST = Arena(_transposed("11111", "1r001", "11101", "1ggg1", "11111"), cell=4.0)
+U4_MAZE = Arena(_transposed("11111", "1ggg1", "1r1g1", "111g1", "1g1g1", "1ggg1", "11111"), cell=4.0)
+U4_MAZE_TEST = Arena(_transposed("11111", "10001", "1r101", "11101", "1g101", "1ggg1", "11111"), cell=4.0)
+U5_MAZE = Arena(
+    _transposed("11111111", "1gggggg1", "1r1111g1", "111111g1", "1g1111g1", "1gggggg1", "11111111"), cell=4.0
+)
+U5_MAZE_TEST = Arena(
+    _transposed("11111111", "10000001", "1r111101", "11111101", "1g1111g1", "1gggggg1", "11111111"), cell=4.0
+)
 BIG_MAZE = Arena(
     _transposed("11111111", "1rg11gg1", "1gg1ggg1", "11ggg111", "1gg1ggg1", "1g1gg1g1", "1ggg1gg1", "11111111"),
     cell=4.0,
@@ -338,7 +365,8 @@ HARDEST_MAZE = Arena(
 
 def _jaxgcrl(body: str, arena: Arena, test: Arena) -> Task:
     goals = {"train": centres(arena, GOAL), "test": centres(test, GOAL)}
-    return maze(body, arena, success_radius=0.5, goals=goals, defaults={"reward": "sparse"})
+    presets = ("fast", "published", "jaxgcrl")
+    return maze(body, arena, success_radius=0.5, goals=goals, defaults={"reward": "sparse"}, presets=presets)
 
 
 def _both(body: str) -> dict[str, Task]:
@@ -352,6 +380,8 @@ def _both(body: str) -> dict[str, Task]:
         f"{body}_3rooms": maze(body, ROOMS_3),
         f"{body}_4rooms": maze(body, ROOMS_4),
         f"{body}_u_maze": _jaxgcrl(body, U_MAZE, U_MAZE_TEST),
+        f"{body}_u4_maze": _jaxgcrl(body, U4_MAZE, U4_MAZE_TEST),
+        f"{body}_u5_maze": _jaxgcrl(body, U5_MAZE, U5_MAZE_TEST),
         f"{body}_big_maze": _jaxgcrl(body, BIG_MAZE, BIG_MAZE_TEST),
         f"{body}_hardest_maze": _jaxgcrl(body, HARDEST_MAZE, HARDEST_MAZE),
     }

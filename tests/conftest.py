@@ -106,6 +106,9 @@ class Fused:
     def fallen(self, data):
         return jnp.zeros((), bool)
 
+    def unhealthy(self, data):
+        return jnp.zeros((), bool)
+
     def dropped(self, data):
         return jnp.zeros((), bool)
 

@@ -348,6 +348,7 @@ def test_pictures_may_be_drawn_in_any_thread(can_draw):
         np.testing.assert_array_equal(other, here)
 
 
+@pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning")  # Python's own, from 3.12 on
 def test_a_process_forked_from_one_that_runs_jax_is_told_so_instead_of_hanging():
     gymnasium.make("star/PointMaze-v0")
     with pytest.warns(RuntimeWarning, match="fork"):

@@ -26,7 +26,8 @@ def test_the_sentences_of_a_page_are_short_and_open_plainly(page):
     text = (ROOT / page).read_text(encoding="utf-8")
     sentences, cells = prose.of_page(text), prose.of_cells(text)
     longest = 10_000 if page.startswith("docs/notebook/") else LONGEST
-    assert faults(sentences + cells, page, longest=longest) == []
+    found = faults(sentences + cells, page, longest=longest)
+    assert not found, "\n".join(found)
     assert sum(map(prose.words, sentences)) <= MEAN * len(sentences)
 
 
@@ -42,7 +43,7 @@ def test_docstrings_comments_and_messages_are_short_and_open_plainly(folder):
             (prose.messages(tree), prose.of_text),
         ):
             found += [fault for line, text in texts for fault in faults(split(text), f"{name}:{line}")]
-    assert found == []
+    assert not found, "\n".join(found)
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-from star.config import agents
-
 ROOT = Path(__file__).parents[1]
 
 
@@ -17,8 +15,3 @@ def test_the_wheel_alone_trains_lists_evaluates_reports_acts_and_draws():
     assert done.returncode == 0, done.stdout + done.stderr
     for said in ("trained 480 env steps", "mine  point_maze", '"episodes": 3', "report.html: 1 run", "site/star"):
         assert said in done.stdout
-
-
-def test_agents_of_the_package_are_small():
-    sizes = {path.stem: path.stat().st_size for path in agents.FOLDER.glob("*.zip")}
-    assert "point_maze" in sizes and max(sizes.values()) <= 2_000_000

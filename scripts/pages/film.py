@@ -1,6 +1,6 @@
 """Make the film of the README and the docs, docs/images/film.gif: an agent that goes to its goal.
 
-    python scripts/pages/film.py [AGENT] [--evaluation-seed 0] [--every 4] [--height 240]
+    python scripts/pages/film.py [AGENT] [--evaluation-seed 0] [--every 6] [--height 240]
 
 AGENT is a run, or an agent of the package (default: ant_maze, or point_maze where that one is not shipped). The film
 shows its greedy episode on the test goal, with region, subgoal and trail, and ends a little after it has arrived. An
@@ -26,7 +26,7 @@ from star.config import agents
 from star.config.loading import load_to_act
 
 FILM = charts.IMAGES / "film.gif"
-AFTER = 10  # env steps at the goal, at the end of the film
+AFTER = 30  # env steps at the goal, at the end of the film
 DEFAULTS = ("ant_maze", "point_maze")
 
 
@@ -68,7 +68,7 @@ def make(agent: str, out: Path, *, seed: int, every: int, height: int) -> dict[s
     }
     few = [one.quantize(charts.COLOURS // 2, dither=Image.Dither.NONE) for one in pictures]
     few[0].save(
-        out, save_all=True, append_images=few[1:], duration=80, loop=0, optimize=True, comment=json.dumps(told).encode()
+        out, save_all=True, append_images=few[1:], duration=100, loop=0, optimize=True, comment=json.dumps(told).encode()
     )
     return told
 
@@ -79,7 +79,7 @@ def main() -> None:
     shipped = [name for name in DEFAULTS if (agents.FOLDER / f"{name}.zip").exists()]
     parser.add_argument("agent", nargs="?", default=shipped[0])
     parser.add_argument("--evaluation-seed", type=int, default=0)
-    parser.add_argument("--every", type=int, default=4, help="draw every Nth env step")
+    parser.add_argument("--every", type=int, default=6, help="draw every Nth env step")
     parser.add_argument("--height", type=int, default=240, help="pixels")
     options = parser.parse_args()
     try:

@@ -6,19 +6,23 @@ from typing import Any
 
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from star.agent.play import Episode
 from star.report import statistics
 
 MEASURES = ("success_any", "success_final")
+MISHAPS = ("flipped", "fallen", "unhealthy")  # fields of `Episode`
+FAILURES = (*MISHAPS, "stuck", "out_of_time")
+"""Why an episode never reached its goal: the first that holds."""
 
 
 class Trials(struct.PyTreeNode):
     """Greedy episodes and what it took to reach their goals, leading axes [E] or [S, E].
 
     `steps` and `path` count env steps and m of the abstract position until the goal is first reached, or those of the
-    whole episode where it is not. `start` is the abstract position at the start.
+    whole episode where it is not. `start` is the abstract position at the start. `failure` is the number in `FAILURES`,
+    or -1 where the goal is reached.
     """
 
     episode: Episode
@@ -26,6 +30,7 @@ class Trials(struct.PyTreeNode):
     path: Float[Array, "*E"]
     start: Float[Array, "*E d"]
     goal: Float[Array, "*E k"]
+    failure: Int[Array, "*E"]
 
 
 def summarise(episode: Episode) -> dict[str, Any]:
@@ -33,8 +38,7 @@ def summarise(episode: Episode) -> dict[str, Any]:
 
     `success_any` and `success_final` come with Wilson score intervals, `distance` (units of the state, at the end of
     the episode), `return` (sum of the task's rewards) and `time_at_goal` (env steps) with Student's t intervals.
-    `flipped` is the share that ends with the body on its back, `failed_flipped` the same of those that never reach the
-    goal, None if all do. Keys ending in `_interval` hold [low, high] at 95 %.
+    `flipped` is the share that ends with the body on its back. Keys ending in `_interval` hold [low, high] at 95 %.
     """
     any_, final, distance, total, flipped, there = (
         np.asarray(getattr(episode, name), np.float64).ravel()
@@ -53,7 +57,6 @@ def summarise(episode: Episode) -> dict[str, Any]:
         "time_at_goal": float(there.mean()),
         "time_at_goal_interval": statistics.mean_interval(there),
         "flipped": float(flipped.mean()),
-        "failed_flipped": float(flipped[any_ == 0].mean()) if (any_ == 0).any() else None,
     }
 
 
@@ -82,6 +85,12 @@ def summarise_way(trials: Trials, shortest: np.ndarray | None, *, dt: float, len
         "spl": float(weighted.mean()) if len(weighted) else None,
         "spl_interval": statistics.mean_interval(weighted) if len(weighted) else None,
     }
+
+
+def failures(trials: Trials) -> dict[str, int]:
+    """Count of episodes that never reached their goal, by the reason in `FAILURES`."""
+    failure = np.ravel(trials.failure)
+    return {name: int((failure == number).sum()) for number, name in enumerate(FAILURES)}
 
 
 def success_behind(episode: Episode, behind: np.ndarray | None) -> dict[str, Any]:

@@ -52,6 +52,7 @@ def evaluations(rows: Sequence[Row]) -> Table:
     for name in ("success_any", "success_final", "s to goal", "m to goal", "SPL", "stayed", "end distance"):
         table.add_column(name, justify="right")
     table.add_column("failed")
+    table.add_column("why")
     several = any(len(row["seeds"]) > 1 for row in rows)
     if several:
         table.add_column(f"seeds above {ABOVE:g}")
@@ -60,11 +61,11 @@ def evaluations(rows: Sequence[Row]) -> Table:
         for seed in row["seeds"]:
             failed = [str(number) for number in seed["failed"][:_SHOWN]]
             more = " ..." * (len(seed["failed"]) > _SHOWN)
-            table.add_row(*begin, str(seed["seed"]), *_cells(seed), " ".join(failed) + more)
+            table.add_row(*begin, str(seed["seed"]), *_cells(seed), " ".join(failed) + more, _why(seed))
         if len(row["seeds"]) > 1:
             over = {f"{name}_interval": row[f"{name}_seeds_interval"] for name in MEASURES}
             learnt = "\n".join(f"{name}: {_above(row[f'{name}_above'])}" for name in MEASURES)
-            table.add_row(*begin, "all", *_cells({**row, **over}), "", learnt)
+            table.add_row(*begin, "all", *_cells({**row, **over}), "", _why(row), learnt)
     return table
 
 
@@ -120,6 +121,11 @@ def _cells(row: Row) -> list[str]:
     success = [_interval(row[name], row[f"{name}_interval"]) for name in MEASURES]
     means = (("seconds_to_goal", ".1f"), ("path_length", ".1f"), ("spl", ".2f"), ("stayed", ".2f"), ("distance", ".2f"))
     return [str(row["episodes"]), *success, *("-" if row[name] is None else format(row[name], f) for name, f in means)]
+
+
+def _why(row: Row) -> str:
+    """`3 flipped, 1 stuck`."""
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in row["failures"].items() if count)
 
 
 def _above(found: Row) -> str:

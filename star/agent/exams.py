@@ -23,7 +23,7 @@ from envs import goal_env, routes
 from envs.common import modes
 from envs.vector import VectorEnv
 from star.agent import environment
-from star.agent.episodes import MEASURES, Trials, success_behind, summarise, summarise_way
+from star.agent.episodes import MEASURES, MISHAPS, Trials, failures, success_behind, summarise, summarise_way
 from star.agent.play import Episode, greedy
 from star.agent.sections import Config
 from star.config.loading import parse
@@ -162,21 +162,33 @@ def player(course: Course, episodes: int) -> Callable[[Any, Any, jax.Array], Tri
         position, success = jax.tree.map(
             lambda many, end: jnp.concatenate([many, end[None]]), moments, look(streams.env)
         )
-        return measure(streams.episode, position, success, goal=spec.goal(streams.env.obs))
+        goal = spec.goal(streams.env.obs)
+        return measure(streams.episode, position, success, goal=goal, radius=spec.success_radius)
 
     return jax.jit(lambda agent, states, keys: jax.vmap(lambda state, key: one(agent, state, key))(states, keys))
 
 
-def measure(ended: Episode, position: jax.Array, success: jax.Array, *, goal: jax.Array) -> Trials:
+def measure(ended: Episode, position: jax.Array, success: jax.Array, *, goal: jax.Array, radius: float) -> Trials:
     """Steps and paths of E episodes, from `position` [T + 1, E, d] and `success` [T + 1, E] at every moment.
 
-    As in the statistics of episodes, the moment before the first step does not count as success.
+    As in the statistics of episodes, the moment before the first step does not count as success. A body is
+    stuck that stays within `radius` of its end for the last half of the time.
     """
     reached = success[1:] > 0
     steps = jnp.where(reached.any(axis=0), jnp.argmax(reached, axis=0) + 1, len(reached))
     legs = jnp.linalg.norm(position[1:] - position[:-1], axis=-1)
     path = jnp.where(jnp.arange(len(legs))[:, None] < steps, legs, 0.0).sum(axis=0)
-    return Trials(episode=ended, steps=steps.astype(jnp.float32), path=path, start=position[0], goal=goal)
+    late = position[len(legs) // 2 :]
+    stuck = (jnp.linalg.norm(late - late[-1], axis=-1) <= radius).all(axis=0)
+    reasons = jnp.stack([*(getattr(ended, name) > 0 for name in MISHAPS), stuck, jnp.ones_like(stuck)])
+    return Trials(
+        episode=ended,
+        steps=steps.astype(jnp.float32),
+        path=path,
+        start=position[0],
+        goal=goal,
+        failure=jnp.where(ended.success_any > 0, -1, jnp.argmax(reasons, axis=0)),
+    )
 
 
 def evaluate(targets: Sequence[Target], exam: Exam, *, quiet: bool = True) -> list[dict[str, Any]]:
@@ -297,7 +309,7 @@ def _row(entry: _Entry, exam: Exam, trials: Trials, shortest: np.ndarray | None)
 
     def summary(trials: Trials, shortest: np.ndarray | None, behind: np.ndarray | None) -> dict[str, Any]:
         found = summarise(trials.episode) | summarise_way(trials, shortest, dt=dt, length=length)
-        return found | success_behind(trials.episode, behind)
+        return found | {"failures": failures(trials)} | success_behind(trials.episode, behind)
 
     per_seed = []
     for i, seed in enumerate(entry.program.seeds):

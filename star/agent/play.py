@@ -41,13 +41,17 @@ class Episode(struct.PyTreeNode):
     total: Float[Array, "B"]
     flipped: Float[Array, "B"]
     """1 where the body lies on its back, at the last step."""
+    fallen: Float[Array, "B"]
+    """The same where it lies in a gap."""
+    unhealthy: Float[Array, "B"]
+    """The same where it is too low or too high."""
     time_at_goal: Float[Array, "B"]
     """Env steps after which the goal counts as reached."""
 
     @classmethod
     def start(cls, num_envs: int) -> Episode:
         """Before the first step."""
-        return cls(*(jnp.zeros(num_envs) for _ in range(6)))
+        return cls(*(jnp.zeros(num_envs) for _ in range(8)))
 
     def after(self, env_state: EnvState, alive: Float[Array, "B"]) -> Episode:
         """With one more env step, to `env_state`, of those that were `alive`."""
@@ -58,6 +62,8 @@ class Episode(struct.PyTreeNode):
             distance=jnp.where(alive > 0, distance, self.distance),
             total=self.total + env_state.reward * alive,
             flipped=jnp.where(alive > 0, env_state.metrics["flipped"], self.flipped),
+            fallen=jnp.where(alive > 0, env_state.metrics["fallen"], self.fallen),
+            unhealthy=jnp.where(alive > 0, env_state.metrics["unhealthy"], self.unhealthy),
             time_at_goal=self.time_at_goal + success * alive,
         )
 

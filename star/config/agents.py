@@ -1,4 +1,4 @@
-"""The trained agents that come with this package, by name: `point_maze`. Each is a run that only acts, as one file."""
+"""The trained agents that come with this package, by name, as `ant_maze`. Each is a run that only acts, as one file."""
 
 from __future__ import annotations
 

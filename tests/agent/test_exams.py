@@ -104,7 +104,7 @@ def test_intervals_are_over_episodes_for_a_seed_and_over_seeds_besides(evaluated
         assert (row[f"{name}_above"]["seeds"], row[f"{name}_above"]["of"]) == (learnt, 2)
         assert row["seeds"][0][f"{name}_interval"][0] < row["seeds"][0][name]
     for seed in row["seeds"]:
-        assert len(seed["failed"]) == round(EPISODES * (1 - seed["success_any"])) > 0
+        assert len(seed["failed"]) == sum(seed["failures"].values()) == round(EPISODES * (1 - seed["success_any"])) > 0
 
 
 def test_the_episode_of_a_number_is_recorded_as_it_was_evaluated(evaluated, still):
@@ -118,12 +118,39 @@ def test_the_episode_of_a_number_is_recorded_as_it_was_evaluated(evaluated, stil
     assert bool(recorded.success[1:].any()) == (1 not in rows[1]["seeds"][1]["failed"])
 
 
+def measured(ended, position, success, radius=1.0):
+    """Trials with goals at the origin."""
+    goal = jnp.zeros(position.shape[1:])
+    return exams.measure(ended, jnp.asarray(position), jnp.asarray(success), goal=goal, radius=radius)
+
+
+def test_the_reason_of_a_failure_is_the_first_that_holds():
+    rng = np.random.default_rng(1)
+    position = rng.normal(size=(9, 60, 2)).cumsum(axis=0)
+    success_any, *mishaps = (rng.random((4, 60)) < [[0.2], [0.3], [0.3], [0.1]]).astype(float)
+    holds = dict(zip(episodes.MISHAPS, mishaps, strict=True))
+    ended = Episode.start(60).replace(success_any=jnp.asarray(success_any), **jax.tree.map(jnp.asarray, holds))
+    found = measured(ended, position, np.zeros((9, 60)), radius=2.5)
+
+    def slow(e):
+        if success_any[e]:
+            return -1
+        still = all(np.hypot(*(position[t, e] - position[8, e])) <= 2.5 for t in range(4, 9))
+        reasons = [*(mishap[e] for mishap in mishaps), still, True]
+        return next(number for number, reason in enumerate(reasons) if reason)
+
+    assert found.failure.tolist() == [slow(e) for e in range(60)] and set(found.failure.tolist()) == {*range(-1, 5)}
+    counted = episodes.failures(found)
+    assert sum(counted.values()) == (success_any == 0).sum()
+    assert counted["flipped"] == ((1 - success_any) * holds["flipped"]).sum()
+
+
 def test_time_and_way_count_until_the_goal_is_first_reached():
     rng = np.random.default_rng(0)
     position = rng.normal(size=(7, 40, 2)).cumsum(axis=0)
     success = (rng.random((7, 40)) < 0.15).astype(float)
     ended = Episode.start(40)
-    found = exams.measure(ended, jnp.asarray(position), jnp.asarray(success), goal=jnp.zeros((40, 2)))
+    found = measured(ended, position, success)
     for e in range(40):
         steps, path = 0, 0.0
         for t in range(1, 7):
@@ -136,7 +163,7 @@ def test_time_and_way_count_until_the_goal_is_first_reached():
 
 def test_the_shortest_way_ends_where_the_goal_counts_as_reached(run):
     course = exams.prepare(config_of(run), Exam(), episodes=1, source=run)
-    trials = exams.measure(Episode.start(2), jnp.zeros((2, 2, 2)), jnp.zeros((2, 2)), goal=jnp.zeros((2, 2)))
+    trials = measured(Episode.start(2), np.zeros((2, 2, 2)), np.zeros((2, 2)))
     trials = trials.replace(goal=np.array([[0.0, 16.0], [3.0, 0.0]]))
     np.testing.assert_allclose(exams.shortest_ways(course, trials), [2 * np.hypot(12, 4) + 8 - 5, 0.0])
 
@@ -144,7 +171,7 @@ def test_the_shortest_way_ends_where_the_goal_counts_as_reached(run):
 def test_a_goal_is_behind_a_wall_unless_who_goes_straight_on_comes_within_its_reach(run):
     course = exams.prepare(config_of(run), Exam(), episodes=1, source=run)
     goals = np.array([[0.0, 16.0], [3.0, 0.0], [0.0, 8.9], [0.0, 9.1], [16.0, 0.0]])
-    trials = exams.measure(Episode.start(5), jnp.zeros((2, 5, 2)), jnp.zeros((2, 5)), goal=jnp.asarray(goals))
+    trials = measured(Episode.start(5), np.zeros((2, 5, 2)), np.zeros((2, 5))).replace(goal=goals)
     behind = exams.behind_walls(course, trials)
     assert behind.tolist() == [True, False, False, True, False]  # the wall begins at y = 4, success 5 m before a goal
     reached = trials.episode.replace(success_any=np.array([1.0, 1.0, 0.0, 0.0, 0.0]))

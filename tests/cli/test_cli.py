@@ -45,6 +45,7 @@ def evaluation(run, *, env_steps):
     """A row as of `assessment.evaluate`."""
     shares = {name: 0.5 for name in ("success_any", "success_final")}
     others = dict.fromkeys(("distance", "return", "seconds_to_goal", "path_length", "stayed"), 7.0) | {"spl": None}
+    others |= {"failures": {"flipped": 0, "fallen": 0, "stuck": 3, "out_of_time": 1}}
     row = {"episodes": 8} | shares | others | {f"{name}_interval": [0.25, 0.75] for name in shares}
     about = {"run": run, "env": "point_maze", "options": {}, "engine": "jax", "env_steps": env_steps, "goals": "test"}
     return about | row | {"film": True, "seeds": [{"seed": 3} | row | {"failed": [2, 5, 6, 7]}]}
@@ -54,7 +55,7 @@ def test_a_table_names_runs_as_they_are_called(capsys):
     names = ["[red]a[/red]", ":smile:", "<script>"]
     exam_tables.show([evaluation(name, env_steps=10) for name in names], None, again="")
     shown = capsys.readouterr().out
-    assert all(name in shown for name in names)
+    assert all(name in shown for name in names) and "3 stuck, 1 out of time" in shown
 
 
 def test_a_run_never_writes_over_another(capsys, folder):

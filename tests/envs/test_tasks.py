@@ -1,5 +1,7 @@
 """Every row of the registry: goals, starts, options."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -175,11 +177,13 @@ def test_only_torso_and_shins_collide_with_feet():
 
 ON_ITS_BACK = {3: 0.0, 4: 1.0, 5: 0.0, 6: 0.0}  # entries of qpos
 IN_THE_GAP = {1: 16.0, 2: 0.75}
+ABOVE = {2: 6.0}
 
 
 @pytest.mark.parametrize("how", ["ignore", "terminate", "truncate"])
 @pytest.mark.parametrize(
-    ("option", "name", "place"), [("flip", "flipped", ON_ITS_BACK), ("fall", "fallen", IN_THE_GAP)]
+    ("option", "name", "place"),
+    [("flip", "flipped", ON_ITS_BACK), ("fall", "fallen", IN_THE_GAP), ("unhealthy", "unhealthy", ABOVE)],
 )
 def test_a_flipped_or_fallen_ant_ends_the_episode_only_if_asked_and_stays_ended(option, name, place, how):
     env = made("ant_fall", **{option: how})
@@ -197,6 +201,38 @@ def test_a_flipped_or_fallen_ant_ends_the_episode_only_if_asked_and_stays_ended(
     again = step(upright, jnp.zeros(8))
     assert (float(again.done), float(again.info["truncation"])) == flags
     assert bool((again.obs == after.obs).all()) == (how != "ignore")
+
+
+def test_the_preset_of_jaxgcrl_gives_its_ant_and_what_is_given_by_name_wins():
+    env = made("ant_u4_maze", preset="jaxgcrl", action_scale=2.0)
+    model = env.body.physics.model
+    assert (env.dt, env.episode_length, env.observation_size) == (pytest.approx(0.05), 1000, 31)
+    assert model.actuator_ctrlrange[0, 1] == 60.0
+    touching = {
+        frozenset(model.geom(i).name.split("_")[0] for i in pair)
+        for pair in itertools.combinations(range(model.ngeom), 2)
+        if any(model.geom_contype[a] & model.geom_conaffinity[b] for a, b in (pair, pair[::-1]))
+    }
+    assert touching == {*map(frozenset, ({"floor", "foot"}, {"wall", "foot"}, {"wall", "torso"}, {"wall", "hip"}))} | {
+        frozenset({"foot"}), frozenset({"foot", "torso"}), frozenset({"foot", "hip"})
+    }  # fmt: skip
+    state = jitted(env.reset)(jax.random.key(0))
+    np.testing.assert_array_equal(state.obs[:2], 0.0)
+    np.testing.assert_allclose(state.obs[7:15], [0, 1, 0, -1, 0, -1, 0, 1], atol=0.1)
+    assert abs(state.obs[2] - 0.55) <= 0.1
+
+
+@pytest.mark.parametrize(("height", "over"), [(0.19, 1.0), (0.5, 0.0), (1.01, 1.0)])
+def test_an_ant_that_is_too_low_or_too_high_ends_the_episode_of_jaxgcrl(height, over):
+    env = made("ant_u4_maze", preset="jaxgcrl", action_scale=2.0)
+    data = jitted(env.reset)(jax.random.key(0)).pipeline_state.data
+    assert float(env.body.unhealthy(data.replace(qpos=data.qpos.at[2].set(height)))) == over
+
+
+def test_only_the_mazes_of_jaxgcrl_have_its_preset():
+    message = r'^option "preset" of ant_fall is .jaxgcrl.; allowed: fast, published$'
+    with pytest.raises(envs.EnvError, match=message):
+        envs.make("ant_fall", preset="jaxgcrl")
 
 
 def test_dropped_contacts_end_the_episode_and_are_counted_once():

@@ -22,11 +22,18 @@ OTHER = {"maze": [0.2, 0.4], "rooms": [0.7, 0.1, 0.9, 1.0], "fall": [0.5]}
 def trials(reached, steps, path, there=None):
     """Episodes that begin at the origin."""
     unused = np.zeros(len(reached))
-    rest = dict.fromkeys(("success_final", "distance", "total", "flipped"), unused)
+    rest = dict.fromkeys(("success_final", "distance", "total", *episodes.MISHAPS), unused)
     there = unused if there is None else np.array(there, float)
     ended = Episode(success_any=np.array(reached, float), time_at_goal=there, **rest)
     places = np.zeros((len(reached), 2))
-    return Trials(episode=ended, steps=np.array(steps, float), path=np.array(path, float), start=places, goal=places)
+    return Trials(
+        episode=ended,
+        steps=np.array(steps, float),
+        path=np.array(path, float),
+        start=places,
+        goal=places,
+        failure=places[:, 0],
+    )
 
 
 def slow_interquartile_mean(values):
@@ -155,11 +162,3 @@ def test_success_is_weighted_by_how_much_longer_than_the_shortest_the_way_was():
     reached, path = np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0]), np.array([10.0, 20.0, 10.0, 0.0, 9.0, 3.0])
     shortest = np.array([10.0, 10.0, 10.0, 0.0, 10.0, np.inf])
     np.testing.assert_allclose(episodes.weighted_success(reached, path, shortest), [1.0, 0.5, 0.0, 1.0, 1.0])
-
-
-def test_the_share_of_failures_that_end_on_the_back_is_none_where_nothing_fails():
-    rest = dict.fromkeys(("success_final", "distance", "total", "time_at_goal"), np.zeros(4))
-    ended = Episode(success_any=np.array([1.0, 0.0, 0.0, 0.0]), flipped=np.array([1.0, 1.0, 0.0, 1.0]), **rest)
-    found = episodes.summarise(ended)
-    assert found["flipped"] == 3 / 4 and found["failed_flipped"] == 2 / 3
-    assert episodes.summarise(ended.replace(success_any=np.ones(4)))["failed_flipped"] is None

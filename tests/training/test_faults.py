@@ -211,7 +211,7 @@ class Rehearsal:
 
 
 def _nothing(agent, state, keys):
-    return Episode(*(jnp.zeros((2, 3)) for _ in range(6)))
+    return Episode(*(jnp.zeros((2, 3)) for _ in range(8)))
 
 
 LOST = "controller/params/log_std"
