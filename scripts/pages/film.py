@@ -68,7 +68,13 @@ def make(agent: str, out: Path, *, seed: int, every: int, height: int) -> dict[s
     }
     few = [one.quantize(charts.COLOURS // 2, dither=Image.Dither.NONE) for one in pictures]
     few[0].save(
-        out, save_all=True, append_images=few[1:], duration=100, loop=0, optimize=True, comment=json.dumps(told).encode()
+        out,
+        save_all=True,
+        append_images=few[1:],
+        duration=100,
+        loop=0,
+        optimize=True,
+        comment=json.dumps(told).encode(),
     )
     return told
 
