@@ -3,7 +3,9 @@
 PYTHON ?= python3
 TEST_EXTRAS ?= test
 PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
+# The first boxes follow no wall; three seeds show how far luck goes.
 CONFIG ?= configs/point_maze.yaml
+QUICK ?= --with configs/ablations/wrong_boxes.yaml --seeds 3 --trainer.eval_every 1 --total-env-steps 800000
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -18,10 +20,12 @@ PINS := pyproject.toml constraints.txt
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-11s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
-quickstart: $(VENV)/.run ## install into .venv and train on the Point Maze (CONFIG=configs/...)
+quickstart: $(VENV)/.run ## install into .venv, train on the Point Maze with refinement and without (CONFIG=...)
 	@dir=runs/quickstart; n=2; \
 	while [ -e "$$dir" ] && [ -n "$$(ls -A "$$dir")" ]; do dir=runs/quickstart-$$n; n=$$((n + 1)); done; \
-	set -x; $(BIN)/star train $(CONFIG) --run-dir "$$dir"
+	set -ex; $(BIN)/star train $(CONFIG) $(QUICK) --run-dir "$$dir"; \
+	$(BIN)/star train $(CONFIG) $(QUICK) --with ablations/no_refinement --run-dir "$$dir-unrefined"; \
+	$(BIN)/python scripts/quickstart.py "$$dir" "$$dir-unrefined"
 
 test: lint ## lint, check the types, run the tests (PYTEST_ARGS=...)
 	$(BIN)/python -m mypy star envs

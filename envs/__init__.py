@@ -4,8 +4,8 @@
 >>> env = envs.VectorEnv(envs.make("point_maze"), 64)
 
 `envs` knows nothing of agents. See docs/environments.md for every task, option and convention, and docs/your_robot.md
-for environments of your own; `envs.worlds` is for learners of skills (docs/worlds.md). What needs JAX is imported when
-it is first used. Where Gymnasium is installed, its ids of the tasks are registered (docs/gymnasium.md).
+for environments of your own; `envs.worlds` is for learners of skills (docs/worlds.md). Modules that need JAX are
+imported at their first use. With Gymnasium installed, its ids of the tasks are registered (docs/gymnasium.md).
 """
 
 from __future__ import annotations

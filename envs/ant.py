@@ -8,7 +8,7 @@ qpos is x, y, z in m, a unit quaternion (w, x, y, z), then hip and ankle of legs
 of the torso in m/s (world frame), its angular velocity in rad/s (body frame), then the 8 joint velocities. Actions
 follow the order of the joints, 1 standing for 30 N m.
 
-With `untimed` the last number, the clock, is left out. What the task holds beside the ant is hidden from this state.
+With `untimed` the last number, the clock, is left out. Other parts of the task are hidden from this state.
 The full one appends, for each block, how far it has slid along each of its axes and how fast, then 1 for each gate
 that is open.
 """
@@ -181,20 +181,20 @@ class Ant:
         return data.replace(qpos=data.qpos.at[:2].add(offset))
 
     def flipped(self, data: PhysicsState) -> jax.Array:
-        """Whether the torso's own up axis points down."""
+        """True if the torso's own up axis points down."""
         return uprightness(data.qpos[np.asarray(ORIENTATION)]) < ON_ITS_BACK
 
     def fallen(self, data: PhysicsState) -> jax.Array:
-        """Whether the torso is below half the height of the floor."""
+        """True if the torso is below half the height of the floor."""
         return data.qpos[2] < self._arena.floor_height / 2
 
     def unhealthy(self, data: PhysicsState) -> jax.Array:
-        """Whether the torso is less than .2 m or more than 1 m above the floor."""
+        """True if the torso is less than .2 m or more than 1 m above the floor."""
         height, (low, high) = data.qpos[2] - self._arena.floor_height, HEALTHY
         return (height < low) | (height > high)
 
     def dropped(self, data: PhysicsState) -> jax.Array:
-        """Whether MJX-Warp ran out of room for contacts."""
+        """True if MJX-Warp ran out of room for contacts."""
         return data.overflow > 0
 
     def model(self) -> mujoco.MjModel:
@@ -206,7 +206,7 @@ class Ant:
         return data.qpos, data.mocap_pos
 
     def _is_open(self, data: PhysicsState) -> jax.Array:
-        """Whether each gate [n] is open."""
+        """True if each gate [n] is open."""
         return data.mocap_pos[:, 2] > self._closed[:, 2] + LIFT / 2
 
     def _at_switch(self, data: PhysicsState) -> jax.Array:

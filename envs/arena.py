@@ -6,8 +6,8 @@ A map has a row of characters for each row of cells:
     #  no floor        B  movable block    D  gate (door)
 
 The centre of the first robot's cell is the origin, +x runs right along a row, +y runs down the rows. Walls, blocks
-and gates are 4 m high whatever the size of the cells, so that no ant leaps over them. Where a map has cells without
-floor, the floor of all others is raised by as much.
+and gates are 4 m high whatever the size of the cells, so that no ant leaps over them. If a map has cells without floor,
+the floor of all others is raised by as much.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 >>> env = envs.adapt(MyEnv(), name="mine:make")
 
 A `GoalEnv` is a brax environment whose observations are its state, then the desired goal. `adapt` looks at all that it
-has to have before anything runs. What it gives besides:
+has to have before anything runs. Optional members:
 
     info["steps"], info["truncation"]     an episode is truncated after `episode_length` steps; `done` before that,
                                           unless the environment calls it a truncation itself, is the task's own end
@@ -38,7 +38,7 @@ ZEROS = ("non_finite", "overflow", "flipped", "fallen", "unhealthy")  # metrics 
 
 
 class GoalEnv(Protocol):
-    """What an environment of a user's own must have; d is the number of its abstract dimensions, k that of its goals.
+    """Members that a user's environment must have; d is the number of abstract dimensions, k that of goals.
 
     Observations are float32 [state_dim + k]: the state, then the desired goal. `State.metrics` holds two scalars:
     `distance`, between what is achieved and the goal, and `success`, 1 where that is close enough, else 0.
@@ -61,11 +61,11 @@ class GoalEnv(Protocol):
     state_dim: int
     action_size: int
     goal_indices: tuple[int, ...]
-    """Which numbers of the state the goal is about [k]."""
+    """Indices of the state that the goal is about [k]."""
     space: tuple[Corner, Corner]
     """Lower and upper corner [d] of the abstract space; goals lie inside."""
     subgoal_scale: tuple[float, ...]
-    """How far a subgoal may lie along each abstract dimension [d], in units of the state."""
+    """Largest distance of a subgoal along each abstract dimension [d], in units of the state."""
     success_radius: float
     """Distance below which the goal counts as reached, in units of the state."""
     episode_length: int
@@ -196,13 +196,13 @@ def need(env: Any, feature: str, *attributes: str) -> None:
 
 
 def has(env: Any, *attributes: str) -> bool:
-    """Whether the user's own environment has all of these attributes."""
+    """True if the user's own environment has all of these attributes."""
     own = getattr(env, "_env", env)
     return all(getattr(own, attribute, None) is not None for attribute in attributes)
 
 
 def _told(wrapped: Wrapped, info: dict[str, Any], *, done: jax.Array, non_finite: jax.Array) -> State:
-    """What `wrapped` looks like from outside; what else there was in `info` stays."""
+    """`wrapped` as it looks from outside; what else there was in `info` stays."""
     inner, zero = wrapped.data, jnp.zeros(())
     metrics = {key: _scalar(inner.metrics.get(key, zero)) for key in ("distance", "success", *ZEROS)}
     return State(

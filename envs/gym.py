@@ -35,7 +35,7 @@ RENDER_MODE = "rgb_array"
 
 
 class _Travels:
-    """What of an environment goes through pickle: how it was made, and the arrays of its state."""
+    """The part of an environment that goes through pickle: how it was made, and the arrays of its state."""
 
     _made: tuple[str, dict[str, Any], int]
     _program: Program

@@ -1,4 +1,4 @@
-"""What the Gymnasium environments run: a batch as two compiled functions, and what of it is on the host.
+"""The engine of the Gymnasium environments: a batch as two compiled functions, and what of it is on the host.
 
 After each call one array goes to the host, a record [B, n + 3]: observation [n], then done, truncation and fault as 0
 or 1.

@@ -31,14 +31,14 @@ from envs.tasks import ENDS, Switch, Task, on_map
 
 
 class Body(Protocol):
-    """What moves in the maze. Its data is any pytree of floating point arrays."""
+    """The moving body in the maze. Its data is any pytree of floating point arrays."""
 
     state_dim: int
     action_size: int
     orientation: tuple[int, ...]
-    """Where in the state the unit quaternion (w, x, y, z) of the body is; empty if it has none."""
+    """Indices of the state with the body's unit quaternion (w, x, y, z); empty if it has none."""
     velocity: tuple[int, ...]
-    """Where in the state its velocity along x and y is, in m/s and the world's axes; empty if it has no orientation."""
+    """Indices of the state with its velocity along x and y (m/s, world's axes); empty without an orientation."""
     dt: float
 
     @property
@@ -58,16 +58,16 @@ class Body(Protocol):
         """The data with the body moved by `offset` [2], in m."""
 
     def flipped(self, data: Any) -> jax.Array:
-        """Whether the body lies on its back (bool)."""
+        """True if the body lies on its back (bool)."""
 
     def fallen(self, data: Any) -> jax.Array:
-        """Whether the body is down in a gap of the floor (bool)."""
+        """True if the body is down in a gap of the floor (bool)."""
 
     def unhealthy(self, data: Any) -> jax.Array:
-        """Whether the body is lower or higher than it can walk (bool)."""
+        """True if the body is lower or higher than it can walk (bool)."""
 
     def dropped(self, data: Any) -> jax.Array:
-        """Whether the engine dropped contacts in the last step (bool)."""
+        """True if the engine dropped contacts in the last step (bool)."""
 
     def model(self) -> Any:
         """A MuJoCo model to draw the task with."""
@@ -222,7 +222,7 @@ class MazeEnv(Env):
 
     @property
     def body(self) -> Body:
-        """What moves in the maze."""
+        """The moving body in the maze."""
         return self._body
 
     @cached_property
@@ -301,7 +301,7 @@ class MazeEnv(Env):
         )
 
     def _ended_by(self, mishaps: dict[str, jax.Array], how: str) -> jax.Array:
-        """Whether one of `mishaps` is to end the episode by `how`."""
+        """True if one of `mishaps` is to end the episode by `how`."""
         return jnp.any(jnp.stack([happened & (self._ends[name] == how) for name, happened in mishaps.items()]))
 
     def _shaken(self, data: Any, noise: jax.Array) -> tuple[Any, jax.Array]:
@@ -352,6 +352,6 @@ def _check_number(what: str, number: Any, *, whole: bool) -> None:
 
 
 def all_finite(data: Any) -> jax.Array:
-    """Whether no floating point number in a pytree is NaN or infinite (bool)."""
+    """True if no floating point number in a pytree is NaN or infinite (bool)."""
     numbers = [leaf for leaf in jax.tree.leaves(data) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.stack([jnp.isfinite(leaf).all() for leaf in numbers]).all()

@@ -1,4 +1,4 @@
-"""Where things are: distributions of points, such as starts and goals. Nothing here needs JAX or MuJoCo."""
+"""Places of things: distributions of points, such as starts and goals. Nothing here needs JAX or MuJoCo."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
     v' = .7 v + .3 max_speed a      a in [-1, 1]^2 is the commanded velocity over max_speed
     x' = x + dt v'                  stopped by walls and closed gates, first along x, then along y
 
-What stops the body along an axis sets its velocity along that axis to 0. The move along an axis is limited by the
+A stop along an axis sets the velocity along it to 0. The move along an axis is limited by the
 nearest wall ahead, whatever its length, so the body cannot jump through a wall.
 """
 
@@ -139,7 +139,7 @@ class Point:
     def _advance(
         self, axis: int, is_open: jax.Array, here: jax.Array, across: jax.Array, aim: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Where a move along `axis` from `here` to `aim` ends, the other coordinate being `across`; if at a wall."""
+        """End of a move along `axis` from `here` to `aim`, the other coordinate being `across`; if at a wall."""
         there = (is_open == 0) | ~self._is_gate
         beside = there & (across > self._lower[:, 1 - axis]) & (across < self._upper[:, 1 - axis])
         ahead = jnp.where(beside & (here <= self._lower[:, axis]), self._lower[:, axis], jnp.inf)

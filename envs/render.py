@@ -4,8 +4,8 @@
     overview   the whole arena, from above and behind
     top        the whole arena, from straight above
 
-In all of them +x points right and +y up, as on the map of `envs.topdown`. What stands between the camera and the
-body is drawn translucent, and of the outer walls only what is near the free cells.
+In all of them +x points right and +y up, as on the map of `envs.topdown`. Walls between the camera and the body are
+drawn translucent. Of the outer walls only the part near the free cells is drawn.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CHASM = 0.4  # brightness of its ground, to that of the floor
 
 
 class Marks(NamedTuple):
-    """What is drawn besides the task itself; what is None is left out.
+    """Marks drawn besides the task itself; any that is None is left out.
 
     `goal` [k] is a desired goal, over the goal dimensions. `subgoal` [d] is a point and `target` ([d], [d]) a box, over
     the abstract dimensions. `trail` [n, 2] are the places (x, y) that the body has been to.
@@ -170,7 +170,7 @@ def frame(
 
 
 def frame_of(arena: Arena) -> np.ndarray:
-    """What of an arena is worth a picture (x_lo, y_lo, x_hi, y_hi): the cells without a wall, and a rim."""
+    """The part of an arena worth a picture (x_lo, y_lo, x_hi, y_hi): the cells without a wall, and a rim."""
     free, rim = arena.free(), RIM * arena.cell
     return np.concatenate([free[:, :2].min(axis=0) - rim, free[:, 2:].max(axis=0) + rim])
 
@@ -257,7 +257,7 @@ def _clear_view(scene: mujoco.MjvScene, body: np.ndarray) -> None:
 
 
 def _meets(box: mujoco.MjvGeom, start: np.ndarray, end: np.ndarray) -> bool:
-    """Whether the segment from `start` to `end` goes into `box`, whose axes are those of the world, and out again."""
+    """True if the segment from `start` to `end` goes into `box`, whose axes are those of the world, and out again."""
     with np.errstate(divide="ignore", invalid="ignore"):
         near, far = ((box.pos + sign * box.size - start) / (end - start) for sign in (-1, 1))
     enter, leave = np.fmax.reduce(np.fmin(near, far)), np.fmin.reduce(np.fmax(near, far))

@@ -9,7 +9,7 @@
     start   the pose of the XML at the start's place, with noise
 
 The robot is the first body of the XML. It stands on a free joint, or on two slide joints along x and y, with others
-after them. The arena brings floor and walls, so the XML has none. What the robot touches with collides with geoms of
+after them. The arena brings floor and walls, so the XML has none. The robot's touching geoms collide with geoms of
 contype 0 and conaffinity 1, so MuJoCo's defaults do.
 """
 
@@ -108,13 +108,13 @@ class Robot:
         return data.replace(qpos=data.qpos.at[:2].add(offset))
 
     def flipped(self, data: PhysicsState) -> jax.Array:
-        """Whether its own up axis points down; never without a free joint."""
+        """True if its own up axis points down; never without a free joint."""
         if not self._free:
             return jnp.zeros((), bool)
         return uprightness(data.qpos[3:7]) < ON_ITS_BACK
 
     def fallen(self, data: PhysicsState) -> jax.Array:
-        """Whether it is below half the height of the floor; never without a free joint."""
+        """True if it is below half the height of the floor; never without a free joint."""
         if not self._free or not self.arena.floor_height:
             return jnp.zeros((), bool)
         return data.qpos[2] < self.arena.floor_height / 2
@@ -124,7 +124,7 @@ class Robot:
         return jnp.zeros((), bool)
 
     def dropped(self, data: PhysicsState) -> jax.Array:
-        """Whether MJX-Warp ran out of room for contacts."""
+        """True if MJX-Warp ran out of room for contacts."""
         return data.overflow > 0
 
     def model(self) -> mujoco.MjModel:
@@ -146,7 +146,7 @@ class Robot:
 
 
 def _stands_free(model: mujoco.MjModel, xml: Path) -> bool:
-    """Whether the first joint is free; raises `EnvError` if neither that nor two slides along x and y come first."""
+    """True if the first joint is free; raises `EnvError` if neither that nor two slides along x and y come first."""
     kinds: Sequence[int] = model.jnt_type
     if len(kinds) and kinds[0] == mujoco.mjtJoint.mjJNT_FREE:
         return True

@@ -1,6 +1,6 @@
 """The shortest ways through a maze: `routes` from the centre of one cell to those of others, `distances` of any points.
 
-A route goes from a cell to one of its four neighbours that is free. Where there is no other it goes through a gate,
+A route goes from a cell to one of its four neighbours that is free. If there is no other, it goes through a gate,
 which the body opens by going to its switch first, or pushes a block, which slides a cell ahead of the body along its
 axes and bridges the gap that it falls into. No route moves more than one block.
 """
@@ -27,7 +27,7 @@ _HEADINGS = ((0, 1), (1, 0), (0, -1), (-1, 0))  # one cell along +x, +y, -x, -y
 
 
 class _Situation(NamedTuple):
-    """Where the body is, what it came along, from where to where it pushed a block, and whether gates are open."""
+    """Place of the body, the way it came along, from where to where it pushed a block, and whether gates are open."""
 
     cell: Cell
     heading: int
@@ -83,7 +83,7 @@ def distances(arena: Arena, starts: np.ndarray, ends: np.ndarray) -> np.ndarray 
 
 
 def hidden(arena: Arena, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Whether walls or gaps stand straight between `starts` and `ends` [n, 2] (bool [n]); blocks and gates do not."""
+    """True if walls or gaps stand straight between `starts` and `ends` [n, 2] (bool [n]); blocks and gates do not."""
     return _blocked(starts, ends, _runs(arena))
 
 
@@ -97,7 +97,7 @@ def _corners(arena: Arena) -> np.ndarray:
 
 
 def _solid(arena: Arena) -> np.ndarray:
-    """Which cells nobody walks through (bool)."""
+    """Mask of the cells nobody walks through (bool)."""
     return np.array([[symbol in WALL + CHASM for symbol in line] for line in arena.rows])
 
 
@@ -132,7 +132,7 @@ def _straight(points: np.ndarray, corners: np.ndarray, runs: np.ndarray) -> np.n
 
 
 def _blocked(starts: np.ndarray, ends: np.ndarray, runs: np.ndarray) -> np.ndarray:
-    """Whether the segments from `starts` to `ends` [n, 2] go through the inside of one of `runs` (bool [n])."""
+    """True if the segments from `starts` to `ends` [n, 2] go through the inside of one of `runs` (bool [n])."""
     found = []
     for i in range(0, len(starts), _AT_ONCE):
         begin, way = starts[i : i + _AT_ONCE, None], (ends - starts)[i : i + _AT_ONCE, None]
@@ -146,7 +146,7 @@ def _blocked(starts: np.ndarray, ends: np.ndarray, runs: np.ndarray) -> np.ndarr
 
 
 def _moves(arena: Arena, here: _Situation, switches: Collection[Cell]) -> Iterator[_Situation]:
-    """What one step can lead to."""
+    """States that one step can lead to."""
     for heading, step in enumerate(_HEADINGS):
         cell, block = _next(here.cell, step), here.block
         if _holds_block(arena, cell, block):
@@ -163,7 +163,7 @@ def _moves(arena: Arena, here: _Situation, switches: Collection[Cell]) -> Iterat
 
 
 def _holds_block(arena: Arena, cell: Cell, block: tuple[Cell, ...]) -> bool:
-    """Whether a block stands in `cell` after `block` has been pushed from its first to its second cell."""
+    """True if a block stands in `cell` after `block` has been pushed from its first to its second cell."""
     if block and cell == block[1]:
         return not _fell(arena, block)
     return _symbol(arena, cell) == BLOCK and cell not in block
@@ -183,7 +183,7 @@ def _way(before: dict[_Situation, _Situation | None], end: _Situation) -> list[_
 
 
 def _turns(arena: Arena, way: list[_Situation], switches: dict[Cell, Point]) -> list[Point]:
-    """Where `way` turns, where it opens the gates that it goes through, and its end."""
+    """Points where `way` turns, where it opens the gates that it goes through, and its end."""
     last = way[-1]
     gated = any(_symbol(arena, here.cell) == GATE for here in way)
     points: list[Point] = []

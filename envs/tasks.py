@@ -46,7 +46,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 @dataclass(frozen=True)
 class Geometry:
-    """What a hierarchical agent is told of a task; indices are those of the state.
+    """Facts of a task for a hierarchical agent; indices are those of the state.
 
     `space` is (lower, upper) of the abstract dimensions, `region_cuts` the interior cuts of each of them, which
     give the first regions, `subgoal_scale` the half-range of a subgoal along each.
@@ -72,14 +72,14 @@ class Geometry:
 
 @dataclass(frozen=True)
 class Switch:
-    """Where a gate opens: positions between `lower` and `upper` (x, y) in m and, for a body that has one, the yaw."""
+    """Place at which a gate opens: positions between `lower` and `upper` (x, y) in m, and the yaw, if any."""
 
     lower: Point
     upper: Point
     yaw: tuple[float, float]
 
     def holds(self, position: Any) -> Any:
-        """Whether `position` [2] is where the gate opens."""
+        """True if `position` [2] is where the gate opens."""
         return ((np.asarray(self.lower) <= position) & (position <= np.asarray(self.upper))).all()
 
     def resized(self, ratio: float) -> Switch:

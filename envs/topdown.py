@@ -3,7 +3,7 @@
 On the map, in m: walls, chasms, blocks and gates where they are, the start, the way of the body, its goal with the
 radius of success and, if there are any, subgoal, target region and the other regions.
 
-What never changes is drawn once; a further sheet costs some milliseconds.
+The unchanging part is drawn once; a further sheet costs some milliseconds.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ def check(path: Path, *, force: bool = False) -> None:
 
 
 def is_still(path: Path) -> bool:
-    """Whether `path` can hold only one picture."""
+    """True if `path` can hold only one picture."""
     return path.suffix.lower() in STILLS
 
 

@@ -6,12 +6,12 @@ The four configurations of AGENT in scripts/tune.yaml are trained with seeds 10 
 two again with seeds 12 to 14 for 8 M, from the beginning. The better of these is chosen. AGENT is a name of
 scripts/results/reproduce.py, such as hiro+td3_tutor; SETTINGS are laid over all configurations.
 
-What counts is the mean over the seeds of success_any in `--episodes` greedy episodes on training goals: on those behind
+The measure is the mean over the seeds of success_any in `--episodes` greedy episodes on training goals: on those behind
 walls, as straight ahead tells nothing of a maze; on Ant Fall on all of them. Test goals do not count.
 
 Every program that has ended is in FILE.json (results/tuning/TASK/AGENT.json): scores, seeds, env steps, seconds,
 command, commit and device. The same command goes on where it was interrupted, from the last checkpoint if `--runs` is
-still there. What is complete is shown again and never written over.
+still there. A complete tuning is shown again and never written over.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def refuse(line: str) -> NoReturn:
 
 
 def plan(options: argparse.Namespace, shared: Mapping[str, Any]) -> dict[str, Any]:
-    """What is to be tuned and how: all that must be equal for it to go on; raises `UserError` for bad settings."""
+    """The tuning: all that must be equal for it to go on; raises `UserError` for bad settings."""
     known = read_file(CONFIGURATIONS)
     if options.agent not in known:
         refuse(f"{options.agent}: has no configurations in {CONFIGURATIONS.name}; known are {', '.join(known)}")

@@ -7,7 +7,7 @@
     star.train("point_maze")         # what `star train` and `star evaluate` print, as plain data
     star.evaluate("runs/NAME")
 
-What needs JAX is imported when it is first used.
+Modules that need JAX are imported at their first use.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ def _config(config: Any, settings: Mapping[str, Any], layers: Sequence[str | Pat
 
 
 def _name(config: Any, layers: Sequence[str | Path], kind: kinds.Kind, resolved: RunConfig) -> str:
-    """What the folder of a run is called, before the time."""
+    """The name of a run's folder, before the time."""
     files = [config, *layers] if isinstance(config, str | Path) else []
     return "-".join(Path(file).stem for file in files) or Path(kind.title(resolved)).name
 

@@ -1,4 +1,4 @@
-"""What `star train --debug` checks: that no operation makes a NaN, and that arrays have the shapes they are said to."""
+"""The checks of `star train --debug`: no operation makes a NaN, and arrays have their annotated shapes."""
 
 from __future__ import annotations
 

@@ -60,12 +60,12 @@ def on(mesh: Mesh | None, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def everywhere(mesh: Mesh | None) -> jax.sharding.Sharding:
-    """Where arrays lie that are whole on each device of `mesh`; without one on the first device."""
+    """Sharding of arrays that are whole on each device of `mesh`; without one on the first device."""
     return SingleDeviceSharding(jax.devices()[0]) if mesh is None else NamedSharding(mesh, _WHOLE)
 
 
 def in_shares(mesh: Mesh | None, *, axis: int = 0) -> jax.sharding.Sharding:
-    """Where arrays lie that are cut along `axis`; without a mesh on the first device."""
+    """Sharding of arrays that are cut along `axis`; without a mesh on the first device."""
     return everywhere(mesh) if mesh is None else NamedSharding(mesh, _cut(axis))
 
 
@@ -130,7 +130,7 @@ def join(cluster: str) -> None:
 
 
 def first() -> bool:
-    """Whether this process is the one that writes."""
+    """True if this process is the one that writes."""
     return jax.process_index() == 0
 
 
@@ -141,7 +141,7 @@ def wait(name: str) -> None:
 
 
 def anywhere(flag: bool) -> bool:
-    """Whether `flag` is set in any process; all of them must ask."""
+    """True if `flag` is set in any process; all of them must ask."""
     return flag if jax.process_count() == 1 else bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
 
 

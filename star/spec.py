@@ -1,4 +1,4 @@
-"""What the levels know of the environment."""
+"""The levels' knowledge of the environment."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from envs.maze import uprightness, yaw
 
 @dataclass(frozen=True)
 class Spec:
-    """What the levels know of the environment."""
+    """The levels' knowledge of the environment."""
 
     state_dim: int
     action_size: int
@@ -87,7 +87,7 @@ class Spec:
         return obs[..., np.asarray(self.abstract_indices)]
 
     def pose(self, obs: Float[Array, "*batch obs"]) -> Float[Array, "*batch p"]:
-        """What subgoals are about: the abstract dimensions, and with a `heading` the vector of that length ahead.
+        """The dimensions of subgoals: the abstract dimensions, and with a `heading` the vector of that length ahead.
 
         The latter is (cos, sin) of the yaw, the angle about z, times the length: in the same unit as positions.
         """
@@ -154,5 +154,5 @@ class Spec:
         return jnp.stack(columns, axis=-1)
 
     def in_goal(self) -> Bool[Array, "d"]:
-        """Which abstract dimensions g* fixes."""
+        """Mask of the abstract dimensions that g* fixes."""
         return jnp.asarray([i in self.goal_indices for i in self.abstract_indices])

@@ -1,4 +1,5 @@
 import importlib
+import importlib.util
 import itertools
 import json
 import operator
@@ -6,10 +7,12 @@ import re
 import shlex
 import shutil
 import sys
+import tomllib
 from pathlib import Path
 
 import jax
 import pytest
+import yaml
 
 import envs
 from envs import opengl
@@ -25,6 +28,7 @@ from star.training import program as programs
 from star.training import trainer
 from star.tutoring import discover
 from tests import small as smaller
+from tests.scripts import load as load_script
 
 ROOT = Path(__file__).parents[1]
 PAGES = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("docs/*.md"))}
@@ -60,6 +64,7 @@ def commands():
     for page, text in PAGES.items():
         lines = [line for block in blocks(page, "bash") for line in block.replace("\\\n", " ").splitlines()]
         for line in lines + [code for code in inline(text) if code not in ("star train", "star evaluate")]:
+            line = line.removeprefix(".venv/bin/")
             if re.match(r"(star|make) \S", line):
                 yield page, shlex.split(line.replace("$SLURM_ARRAY_TASK_ID", "3"), comments=True)
 
@@ -74,8 +79,9 @@ def folder(tmp_path, monkeypatch):
     """A working directory with the shipped config files and those of the tutorial, where no command really trains."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "configs").symlink_to(ROOT / "configs")
-    for page in ("tutorial", "howto", "experiments", "your_robot", "worlds", "saht"):
-        for name, text in files(f"docs/{page}.md").items():
+    told = [f"docs/{page}.md" for page in ("tutorial", "howto", "experiments", "your_robot", "worlds", "saht")]
+    for page in ("README.md", *told):
+        for name, text in files(page).items():
             (tmp_path / name).write_text(text)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(trainer, "train", lambda config, run_dir, **_: trainer.Result(run_dir, 0, False, None))
@@ -190,9 +196,10 @@ def test_every_make_target_of_the_pages_exists(words):
     assert words[1] in targets
 
 
-def test_the_readme_begins_with_its_two_commands():
-    first = blocks("README.md", "bash")[0]
-    assert [line.split("#")[0].strip() for line in first.splitlines()] == ["make quickstart", "make test"]
+def test_the_readme_begins_with_a_clone_and_two_commands_and_stays_short():
+    first = [line.split("#")[0].split() for line in blocks("README.md", "bash")[0].splitlines()]
+    assert [words[:2] for words in first] == [["git", "clone"], ["make", "quickstart"], [".venv/bin/star", "render"]]
+    assert len(PAGES["README.md"].splitlines()) <= 120
 
 
 def slug(heading):
@@ -370,3 +377,83 @@ def test_the_teacher_of_the_sgim_page_shows_the_way_over_the_gap():
     names: dict = {}
     exec(example, names)
     assert names["route"].tolist() == [[8, 0, 4.5], [8, 24, 4.5], [0, 24, 4.5], [0, 24, 4.5]]
+
+
+SCRIPTS = sorted({(page, line) for page in PAGES for block in blocks(page, "bash")
+                  for line in block.replace("\\\n", " ").splitlines() if line.startswith("python ")})  # fmt: skip
+
+
+@pytest.mark.parametrize(("page", "line"), SCRIPTS)
+def test_every_script_of_the_pages_is_there_and_has_the_flags_that_it_is_given(page, line):
+    _, script, *words = shlex.split(line, comments=True)
+    if script == "-m":
+        assert importlib.util.find_spec(words[0])
+        return
+    text = (ROOT / script).read_text(encoding="utf-8")
+    own = words[: words.index("--")] if "--" in words else words
+    for flag in (word for word in own if word.startswith("--") and "." not in word):
+        assert f'"{flag.partition("=")[0]}"' in text, flag
+
+
+def test_the_dockerfile_copies_what_the_wheel_is_made_of_and_installs_the_extras_for_a_gpu():
+    lines = re.sub(r"\\\n\s*", "", (ROOT / "Dockerfile").read_text(encoding="utf-8")).splitlines()
+    told = [line.split(" ", 1) for line in lines if line and not line.startswith("#")]
+    assert {word for word, _ in told} == {"FROM", "RUN", "WORKDIR", "COPY", "ENV", "ENTRYPOINT", "CMD"}
+    copied = [word for name, rest in told if name == "COPY" for word in rest.split()[:-1]]
+    assert all((ROOT / name).exists() for name in copied)
+    built = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    wheel = built["tool"]["hatch"]["build"]["targets"]["wheel"]
+    project = built["project"]
+    assert {*wheel["packages"], *wheel["force-include"], project["readme"], *project["license-files"]} <= set(copied)
+    (extras,) = re.findall(r"'\.\[([\w,]+)\]'", "\n".join(lines))
+    assert set(extras.split(",")) <= project["optional-dependencies"].keys()
+    assert re.match(r"python:3\.1[12]-", told[0][1])
+
+
+def test_the_citation_names_the_paper_of_the_readme():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    paper = cited["preferred-citation"]
+    assert {"cff-version", "message", "title", "authors"} <= cited.keys()
+    for told in (paper["title"], str(paper["year"]), *(one["family-names"] for one in paper["authors"])):
+        assert told in blocks("README.md", "bibtex")[0]
+    built = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert cited["version"] == built["project"]["version"] and cited["license"] == built["project"]["license"]
+
+
+def test_the_pictures_of_the_pages_are_used_and_small():
+    images = sorted((ROOT / "docs" / "images").iterdir())
+    assert sum(image.stat().st_size for image in images) < 2_000_000
+    assert [image.name for image in images if not any(f"images/{image.name})" in text for text in PAGES.values())] == []
+
+
+def test_the_film_ends_on_the_goal():
+    told = load_script("pages/film").ending()
+    assert told["success"] and told["distance"] < 5 and PAGES["README.md"].count("film.gif") == 1
+
+
+FOR_A_GPU = {path.stem for path in ROOT.glob("configs/*.yaml") if "NVIDIA GPU" in path.read_text().splitlines()[0]}
+FOR_A_GPU |= {"paper/many"}
+SHELL = [
+    (page, line) for page in PAGES for block in blocks(page, "bash") for line in block.replace("\\\n", " ").splitlines()
+]
+
+
+def wants_a_gpu(words):
+    """Whether a command line trains on a config that is made for a GPU."""
+    names = {re.sub(r"^configs/|\.yaml$", "", word).split("/one_by_one")[0] for word in words}
+    trains = words[1:2] == ["train"] or words[0] == "python"
+    return trains and bool(names & FOR_A_GPU) and not {"--dry-run", "native"} & set(words)
+
+
+@pytest.mark.parametrize(("page", "line"), [one for one in SHELL if re.match(r"star |python ", one[1])])
+def test_a_command_that_wants_a_gpu_carries_its_mark(page, line):
+    command, _, comment = line.partition(" #")
+    assert not wants_a_gpu(shlex.split(command)) or "GPU" in comment, f"{page}: add # GPU to: {line}"
+
+
+def test_commands_for_a_gpu_are_told_from_others():
+    assert wants_a_gpu(["star", "train", "ant_maze"]) and wants_a_gpu(
+        ["star", "train", "configs/ant_fall.yaml", "--seeds", "5"]
+    )
+    assert not wants_a_gpu(["star", "train", "ant_maze_cpu"]) and not wants_a_gpu(["star", "render", "ant_maze"])
+    assert not wants_a_gpu(["star", "train", "ant_maze", "--dry-run"]) and wants_a_gpu(["python", "x.py", "ant_maze"])

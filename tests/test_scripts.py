@@ -126,6 +126,9 @@ def test_agents_and_ablations_are_found_and_others_refused():
         script.layer("hirro")
 
 
+TODAY = {"settings": "a1", "moved": {"tutor": 0.5}}
+
+
 def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatch):
     """A stand-in for `star` writes metrics and reports the seeds that its run was trained with."""
     script, trained = load("results/reproduce"), []
@@ -151,6 +154,7 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
         return argparse.Namespace(stdout=json.dumps(report) + "\n")
 
     monkeypatch.setattr(script.subprocess, "run", run)
+    monkeypatch.setattr(script.digest, "of", lambda command: TODAY)
     common = ["--runs", str(tmp_path / "runs"), "--commit", "c0ffee"]
     for seeds, flags, out in ((2, (), "a"), (5, (), "a"), (2, ("--one-by-one",), "b"), (2, ("--one-by-one",), "b")):
         folder = tmp_path / out
@@ -164,13 +168,34 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
     ]
     assert {program["device"] for program in kept["runs"]} == {"abacus"}
     assert {seed["training_seconds_to_level"] for seed in kept["seeds"]} == {5.0}
+    assert {program["digest"]["settings"] for program in kept["runs"]} == {"a1"}
     script.main(["point_maze", "star", "--seeds", "1", "--out", str(tmp_path / "c"), *common, "--", "--seed", "7"])
-    assert trained[-1] == [0] and len(list((tmp_path / "runs" / "point_maze").glob("star-0-*"))) == 2
+    assert trained[-1] == [0] and len(list((tmp_path / "runs" / "point_maze").glob("star-0-*"))) == 3
     assert "| star | 5 | 0.5 k | 1.000 [0.996, 1.000] | 0.500 [" in (tmp_path / "a" / "table.md").read_text()
     (tmp_path / "a" / "star.json").unlink()
     (tmp_path / "a" / "notes.json").write_text("not a report", encoding="utf-8")
     script.main(["point_maze", "star", "--out", str(tmp_path / "a"), "--runs", str(tmp_path / "others")])
     assert len((tmp_path / "a" / "curves.jsonl").read_text().splitlines()) == 5
+
+    monkeypatch.setattr(script.digest, "of", lambda command: TODAY | {"moved": {"tutor": 0.6}})
+    before = len(trained)
+    script.main(["point_maze", "star", "--seeds", "2", "--out", str(tmp_path / "a"), *common])
+    kept = json.loads((tmp_path / "a" / "star.json").read_text(encoding="utf-8"))
+    assert trained[before:] == [[0, 1]] and [seed["seed"] for seed in kept["seeds"]] == [0, 1]  # begun anew
+    assert len((tmp_path / "a" / "curves.jsonl").read_text().splitlines()) == 2
+
+
+def test_a_row_is_measured_anew_as_its_json_says(tmp_path, monkeypatch):
+    script, asked = load("results/reproduce"), []
+    monkeypatch.setattr(script, "fill", asked.append)
+    script.main(["ant_fall/gara", "ant_fall/one_by_one/star"])
+    out = script.ROOT / "results" / "ant_fall"
+    many = ["--trainer.num_envs", "2048", "--total-env-steps", "20000000", "--commander.epsilon_steps", "5000000"]
+    told = ["--seed", "0", "--seeds", "5", "--out", str(out), "--level", "0.9", "--episodes", "200", "--", *many]
+    assert asked[0] == ["ant_fall", "gara", *told]
+    assert asked[1][-2:] == ["--one-by-one", "--"] and asked[1][7] == str(out / "one_by_one")
+    with pytest.raises(SystemExit, match=r"ant_fall/garra: results/ant_fall/garra.json is no row of results"):
+        script.main(["ant_fall/garra"])
 
 
 TUNE = load("tune")

@@ -1,1 +1,1 @@
-"""What `envs` and everything built on it stand on: errors for people, files, and batches."""
+"""The ground of `envs` and everything built on it: errors for people, files, and batches."""

@@ -1,4 +1,4 @@
-"""What is wrong, said to a person in one line."""
+"""Errors for a person, in one line."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ _OURS = [Path(__file__).parents[2] / package for package in ("envs", "star")]
 
 
 class UserError(ValueError):
-    """What a person can mend. The message is one line: the key or path, the value, what is allowed.
+    """An error that a person can mend. The message is one line: the key or path, the value, what is allowed.
 
     The command line prints it and ends with exit code 2.
     """
 
 
 class Notice(UserWarning):
-    """What a person should know though nothing is refused. The message is one line; the command line prints it."""
+    """A warning to a person; nothing is refused. The message is one line, and the command line prints it."""
 
 
 def shown(value: Any, limit: int = 60) -> str:
@@ -42,6 +42,6 @@ def where_raised(error: Exception) -> str:
 
 
 def _is_authors(file: Path) -> bool:
-    """Whether a file is neither this package's, nor an installed one's, nor Python's."""
+    """True if a file is neither this package's, nor an installed one's, nor Python's."""
     elsewhere = {*_OURS, *(Path(sysconfig.get_path(name)) for name in ("stdlib", "purelib", "platlib"))}
     return file.is_file() and not elsewhere & set(file.parents) and "dist-packages" not in file.parts

@@ -1,4 +1,4 @@
-"""How to install what is needed besides: a command that can be pasted, for a clone and for an installed wheel."""
+"""Installing optional packages: a command that can be pasted, for a clone and for an installed wheel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def install(*extras: str) -> str:
 
 
 def _packages(extra: str) -> list[str]:
-    """What the wheel's own metadata say of an extra."""
+    """An extra's entry in the wheel's own metadata."""
     try:
         found = requires(_DISTRIBUTION) or []
     except PackageNotFoundError:  # copied, not installed

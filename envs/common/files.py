@@ -43,7 +43,7 @@ def check(path: Path, endings: Sequence[str], *, force: bool = False) -> None:
 
 @contextlib.contextmanager
 def whole(path: Path) -> Iterator[Path]:
-    """Where to write what becomes `path`, replacing an existing file, once all has been written.
+    """A partial file to write; once whole it becomes `path` and replaces an existing file.
 
     Raises:
       UserError: in one line, if it cannot be written.

@@ -1,8 +1,8 @@
 """Code that users add from a file of their own, named `module:name`.
 
 Configs and run folders may come from strangers, so a module is used only if its user has said so: typed its name on the
-command line, or named it in `STAR_IMPORT` (several with commas between); programs call `trust`. That Python has
-imported it already says nothing: it has imported `logging`, whose functions write files.
+command line, or named it in `STAR_IMPORT` (several with commas between); programs call `trust`. An earlier import by
+Python says nothing: it has imported `logging`, whose functions write files.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ def check_regular(path: Path) -> None:
 
 
 def text(path: Path) -> str:
-    """What a file of UTF-8 text holds.
+    """The content of a file of UTF-8 text.
 
     Raises:
       OSError: if it cannot be read, is no regular file, or is too large.
@@ -42,7 +42,7 @@ def text(path: Path) -> str:
 
 
 def plain(text: str) -> Any:
-    """What the YAML document `text` says: dictionaries, lists, text, numbers and bytes.
+    """The values of the YAML document `text`: dictionaries, lists, text, numbers and bytes.
 
     Numbers are those of YAML 1.2: `010` is ten and `1e-4` is a number, `1:30` and `2024-01-02` are text.
 
@@ -60,7 +60,7 @@ def plain(text: str) -> Any:
 
 
 def problem(error: yaml.YAMLError) -> str:
-    """What is wrong, in a few words, without the place."""
+    """The error in a few words, without its place."""
     return getattr(error, "problem", None) or getattr(error, "reason", None) or "bad input"
 
 

@@ -3,7 +3,7 @@
     trace = world.trace(sequence, length)
     video.write(Path("line.gif"), draw.film(world, trace, length=length, task="line", goal=goal))
 
-What a world looks like says its `sketch`; one without a sketch is shown by its outcomes.
+The `sketch` of a world draws its looks; one without a sketch is shown by its outcomes.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 The tip of the arm takes what it touches with an empty hand. The pen stays in the hand, and draws where the tip presses
 it on the paper, z <= 0. A joystick is let go outside of its cube. At the end of a primitive joystick 1 gives the game
-character its x, and joystick 2 its y. Who touches another object with a full hand breaks both, and only the tip counts.
+character its x, and joystick 2 its y. Touching another object with a full hand breaks both, and only the tip counts.
 
 A primitive lasts 1 s, 30 control steps. Its 14 numbers are, for each joint, three weights and the goal of a DMP over
 pi rad, then the height half way through and at the end, in m.

@@ -1,4 +1,4 @@
-"""How long an epoch takes in two checkouts, measured in turn on one machine.
+"""Measure the time of an epoch in two checkouts, in turn on one machine.
 
     python scripts/benchmarks/compare_epochs.py OLD NEW configs/ant_maze.yaml [--epochs 10] [--section.key VALUE ...]
 
@@ -103,7 +103,7 @@ class Worker:
         )
 
     def told(self) -> dict[str, Any]:
-        """What it says next; MJX and Warp may say things in between."""
+        """Its next line; MJX and Warp may say things in between."""
         assert self._process.stdout is not None
         for line in self._process.stdout:
             if line.startswith("{"):

@@ -1,4 +1,4 @@
-"""How training grows with the number of devices, each with the same number of environments, in one run on one machine.
+"""Measure the speed of training on more devices, each with as many environments, in one run on one machine.
 
     python scripts/benchmarks/devices.py configs/ant_maze.yaml --devices 1 2 4 [--epochs 3] [--per-device-envs 4096]
 
@@ -9,9 +9,9 @@ and seeds:
     acting     greedy episodes: environments, Commander, Tutor and Controller
     epoch      all of an epoch, which also learns and refines
 
-`ratio` holds these speeds over those of one device, if 1 comes first. What keeps `epoch` below `acting` is learning:
-its messages between devices, and what every device does for itself. Each number of devices is measured in a process of
-its own.
+`ratio` holds these speeds over those of one device, if 1 comes first. Learning keeps `epoch` below `acting`: its
+messages between devices, and what every device does for itself. Each number of devices is measured in a process of its
+own.
 """
 
 from __future__ import annotations

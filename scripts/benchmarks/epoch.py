@@ -1,4 +1,4 @@
-"""Where the time of an epoch goes: bare physics, whole epoch, refinement, in one run on one machine.
+"""Measure the parts of an epoch: bare physics, whole epoch, refinement, in one run on one machine.
 
     python scripts/benchmarks/epoch.py configs/ant_maze.yaml [--epochs 3] [--section.key VALUE ...]
 

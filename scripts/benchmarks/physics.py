@@ -1,4 +1,4 @@
-"""How fast a task runs, and what the environment costs on top of its engine, in one run on one machine.
+"""Measure the speed of a task, and the cost of the environment on top of its engine, in one run on one machine.
 
     python scripts/benchmarks/physics.py ant_maze ant_fall --engine warp --envs 4096 16384 --out speed.json
 

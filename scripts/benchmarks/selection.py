@@ -1,4 +1,4 @@
-"""How well SGIM and other selectors spend their episodes on beds whose laws are known.
+"""Measure how well SGIM and other selectors spend their episodes on beds whose laws are known.
 
     python scripts/benchmarks/selection.py [--seeds 16] [--blocks 2400] [--out results/sgim]
 
@@ -88,7 +88,7 @@ def all_selectors(bed: Bed) -> Iterator[tuple[str, str, Selector]]:
 def measure(
     bed: Bed, selector: Selector, hopeless: list[int], idle: list[int], *, seeds: int, blocks: int
 ) -> dict[str, Any]:
-    """What became of `seeds` learners."""
+    """The history of `seeds` learners."""
     play: Callable = jax.jit(jax.vmap(lambda key: beds.run(bed, selector, blocks=blocks, episodes=EPISODES, key=key)))
     course = jax.tree.map(np.asarray, play(jax.random.split(jax.random.key(0), seeds)))
     until = np.asarray(jax.vmap(beds.until_mastered)(course))

@@ -1,4 +1,4 @@
-"""How long a sweep takes side by side, and how long the same number of its trials take one after another.
+"""Measure the time of a sweep side by side, and of as many of its trials one after another.
 
     python scripts/benchmarks/sweep.py configs/sweeps/point_maze.yaml [--alone 4] [--section.key VALUE ...]
 

@@ -1,4 +1,4 @@
-"""How many executions a world makes in a second on this machine.
+"""Measure the executions of a world in a second on this machine.
 
     python scripts/benchmarks/worlds.py [pen throw] [--batch 200 4096] [--repeats 20] [--out speed.json]
 

@@ -118,7 +118,7 @@ def near_walls(state: TrainState, walls: np.ndarray, space: np.ndarray) -> dict[
 
 
 def _complete(decision: Decision) -> np.ndarray:
-    """Which decisions lasted k env steps and aimed at another region."""
+    """Mask of the decisions that lasted k env steps and aimed at another region."""
     return (decision.weight > 0) & (decision.region != decision.target)
 
 

@@ -73,7 +73,7 @@ class _Untrained(BaseException):
 
 @dataclasses.dataclass
 class Trial:
-    """What became of a case: one of `FINE`, or else what is wrong; and what was said."""
+    """The end of a case: one of `FINE`, or else the fault; and its last line."""
 
     ended: str
     line: str

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""How often the 95 % intervals of `star.report.statistics` hold the truth: the table of docs/evaluation.md.
+"""Measure how often the 95 % intervals of `star.report.statistics` hold the truth: the table of docs/evaluation.md.
 
     python scripts/checks/intervals.py [--draws 4000]
 

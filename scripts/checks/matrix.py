@@ -203,7 +203,7 @@ OBJECTS: Mapping[str, Callable[[], Any]] = {
 
 
 def outcome(use: Callable[[], Any]) -> str:
-    """What came of using something: that it works, the one line that refuses it, or a fault."""
+    """The result of using something: it works, the one line that refuses it, or a fault."""
     from envs.common.errors import UserError
 
     try:
@@ -380,7 +380,7 @@ def travels() -> Table:
 
 
 def importable(name: str) -> bool:
-    """Whether there is a module of this name."""
+    """True if there is a module of this name."""
     import importlib.util
 
     return importlib.util.find_spec(name) is not None
@@ -548,7 +548,7 @@ def _is_read_as(read: Callable[[Path], Any], path: Path, expected: Any) -> None:
 
 
 def versions() -> str:
-    """What this machine has."""
+    """The equipment of this machine."""
     import jax
     import mujoco
 

@@ -25,7 +25,7 @@ LIMIT = 300  # s, of one test: some faults are that something hangs
 
 @dataclass(frozen=True)
 class Mend:
-    """What was wrong, the test that holds it, and how `now` in `file` is taken back to `before`."""
+    """A fault, the test that holds its mend, and the change of `now` in `file` back to `before`."""
 
     fault: str
     test: str
@@ -354,7 +354,7 @@ MENDS = (
 
 
 def outcome(mend: Mend) -> str:
-    """What comes of the test of `mend` in a copy of the tree, with the mend and without."""
+    """The result of the test of `mend` in a copy of the tree, with the mend and without."""
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder)
         copy(tree)
@@ -377,7 +377,7 @@ def copy(tree: Path) -> None:
 
 
 def passes(test: str, tree: Path) -> bool:
-    """Whether pytest passes there: no less than one test, and none fails. What hangs fails."""
+    """True if pytest passes there: no less than one test, and none fails. A test that hangs fails."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", test]
     environment = os.environ | {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
     try:

@@ -131,7 +131,7 @@ def distributions(batch: Batch, rollouts: int, steps: int) -> dict[str, float]:
 
 
 def barred(batch: Batch, state: Any, n: int) -> np.ndarray:
-    """Whether each of the first n torsos is inside a wall, a closed gate, the floor, or out of the maze."""
+    """True if each of the first n torsos is inside a wall, a closed gate, the floor, or out of the maze."""
     arena = batch.env.arena
     data = state.pipeline_state.data
     x, y, z = np.asarray(data.qpos[:n, :3]).T
@@ -180,7 +180,7 @@ def throws(batch: Batch, number: int) -> int:
 
 
 def rest(batch: Batch) -> dict[str, float]:
-    """Where ants are after 2 s without action, and how many contacts MuJoCo finds there."""
+    """Places of ants after 2 s without action, and MuJoCo's number of contacts there."""
     state = batch.reset(jax.random.key(4))
     for _ in range(REST_STEPS):
         state = batch.step(state, jnp.zeros((batch.size, 8)))

@@ -7,9 +7,9 @@ For each layer (a file that is laid over a task with `--with`) OLD trains for fi
 goes on from OLD's checkpoint after two. All leaves of the state after four epochs have to be equal bit for bit, fresh
 and resumed, and the metrics within 1e-6 of one another.
 
-Where they are not, both have to start alike, and NEW trains one epoch from each of OLD's checkpoints after 0, 2 and 4
+If they are not, both have to start alike, and NEW trains one epoch from each of OLD's checkpoints after 0, 2 and 4
 epochs: whole numbers have to be equal, the others within 1e-5 of the largest of their leaf. Such a row is `close`, and
-wants a reason in the commit. A layer that OLD does not have is `new`, and not compared. Where a command fails the row
+wants a reason in the commit. A layer that OLD does not have is `new`, and not compared. If a command fails the row
 says `fails`, and the others go on.
 
 Both checkouts run in the same Python on the same machine: rounding depends on the processor. They are compiled in
@@ -152,6 +152,7 @@ ROWS: dict[str, Row] = {
     "ablations/td3_tutor": Row(settings=POINT | SMALL_TD3),
     "ablations/td3_uncorrected": Row(settings=POINT | SMALL_TD3),
     "ablations/world_frame": Row("ant_maze_cpu", ANT),
+    "ablations/wrong_boxes": Row(),
     "sgim/all": Row(),
     "sgim/exploration": Row(),
     "sgim/goals": Row(),
@@ -169,14 +170,14 @@ VERDICTS = ("same", "close", "differs", "fails", "new")
 
 
 class Place(NamedTuple):
-    """Where runs are written, and where those of OLD and what was compiled may stay."""
+    """The folder of runs, and one in which those of OLD and compiled programs may stay."""
 
     folder: Path
     kept: Path
 
 
 class Found(NamedTuple):
-    """What a comparison found: one of `VERDICTS`, the first thing that differs, and how many cuts OLD made."""
+    """The result of a comparison: one of `VERDICTS`, the first difference, and the number of OLD's cuts."""
 
     verdict: str
     detail: str = ""
@@ -326,7 +327,7 @@ def leaves(run: Path, env_steps: int) -> dict[str, np.ndarray]:
 
 
 def bits(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> list[str]:
-    """What differs between two states, leaf by leaf, if only in a bit."""
+    """Differences between two states, leaf by leaf, if only in a bit."""
     return [
         f"{name} {_apart(old.get(name), new.get(name))}"
         for name in sorted(old | new)
@@ -335,7 +336,7 @@ def bits(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> list[s
 
 
 def rounding(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> list[str]:
-    """What differs between two states by more than rounding."""
+    """Differences between two states by more than rounding."""
     wrong = []
     for name in sorted(old | new):
         if name not in old or name not in new or old[name].shape != new[name].shape:
@@ -365,7 +366,7 @@ def _apart(a: np.ndarray | None, b: np.ndarray | None) -> str:
 
 
 def metrics(old: Path, new: Path, end: int) -> list[str]:
-    """What differs between the metrics of two runs up to so many env steps."""
+    """Differences between the metrics of two runs up to so many env steps."""
     wrong = []
     theirs, ours = ([line for line in lines(run) if line["env_steps"] <= end] for run in (old, new))
     if len(theirs) != len(ours):

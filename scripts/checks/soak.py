@@ -1,4 +1,4 @@
-"""What a run survives: being killed again and again, damaged checkpoints, and half an hour without growth of memory.
+"""Check that a run survives kills and damaged checkpoints, and half an hour without growth of memory.
 
     python scripts/checks/soak.py kills [--kills 100] [--damages 20] [--out results/soak/kills_cpu.json]
     python scripts/checks/soak.py memory configs/ant_maze.yaml [--minutes 30] [--out FILE] [--section.key VALUE ...]
@@ -111,7 +111,7 @@ class Soak:
 
 
 def said(run: Path) -> str:
-    """What the latest process of `run` wrote to stderr."""
+    """Stderr of the latest process of `run`."""
     return run.with_suffix(".err").read_text()
 
 
@@ -130,7 +130,7 @@ def steps(run: Path) -> list[int]:
 
 
 def end(run: Path) -> dict[str, Any]:
-    """What has to be the same whether or not a run was killed."""
+    """The parts that have to be the same whether or not a run was killed."""
     checkpoints, journal = Checkpoints(run), Journal.of(run, tables="regions")
     last = checkpoints.steps()[-1]
     checkpoints.check(last)

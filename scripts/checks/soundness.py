@@ -56,7 +56,7 @@ CHUNK = 10_000
 
 
 def check_triples(count: int, *, seed: int = 0, chunk: int = CHUNK) -> dict[str, Any]:
-    """How many of `count` random triples, in equal shares of NETWORKS and of MODELS, have their image outside."""
+    """Number of triples with their image outside, of `count` random ones in equal shares of NETWORKS and of MODELS."""
     rng = np.random.default_rng(seed)
     kinds = [(partial(random_networks, *one), 0.5 / len(NETWORKS)) for one in NETWORKS]
     kinds += [(partial(random_models, *one), 0.5 / len(MODELS)) for one in MODELS]
@@ -71,7 +71,7 @@ def check_triples(count: int, *, seed: int = 0, chunk: int = CHUNK) -> dict[str,
 
 
 def margins(low: np.ndarray, high: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """How far inside [low, high] each image [..., d] is, in units in the last place of the border's largest number."""
+    """Distance of each image [..., d] to the border of [low, high], in units in the last place (of the largest)."""
     unit = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(np.float32)).astype(np.float64)
     return (np.minimum(image - low, high - image) / unit).min(axis=-1)
 
@@ -213,7 +213,7 @@ def _images(
     points: int,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Where F_k sends all corners and `points` random points of a part under the command `target`."""
+    """Images under F_k of all corners and `points` random points of a part under the command `target`."""
     model, d = state.forward_model, len(lower)
     shares = np.concatenate([np.array(list(product((0, 1), repeat=d))), rng.random((points, d))])
     start = np.clip((lower + shares * (upper - lower)).astype(np.float32), lower, upper)

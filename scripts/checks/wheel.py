@@ -83,7 +83,7 @@ class Newcomer:
         return True
 
     def python(self, words: Sequence[str]) -> str:
-        """What a script prints."""
+        """The output of a script."""
         done = self._run(words)
         self._check("python", done)
         return done.stdout

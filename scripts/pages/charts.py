@@ -6,15 +6,23 @@ import io
 from pathlib import Path
 
 from matplotlib.figure import Figure
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
 COLOURS = 128
 
 
-def save(figure: Figure, name: str, *, dpi: int) -> None:
-    """Draw `figure` as the chart `name`; an older one is replaced."""
+def save(figure: Figure, name: str, *, dpi: int, of: str = "") -> None:
+    """Draw `figure` as the chart `name`; an older one is replaced. `of` says what is shown, and `shown` reads it."""
     drawn = io.BytesIO()
     figure.savefig(drawn, dpi=dpi)
     chart = Image.open(drawn).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
-    chart.save(IMAGES / f"{name}.png", optimize=True)
+    told = PngImagePlugin.PngInfo()
+    told.add_text("of", of)
+    chart.save(IMAGES / f"{name}.png", optimize=True, pnginfo=told)
+
+
+def shown(name: str) -> str:
+    """The `of` with which the chart `name` was saved."""
+    with Image.open(IMAGES / f"{name}.png") as chart:
+        return str(chart.info["of"])

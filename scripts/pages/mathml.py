@@ -22,4 +22,4 @@ def _converted(found: re.Match[str]) -> str:
     mathml = convert(html.unescape(latex), display="block" if tag == "div" else "inline")
     if "\\" in mathml:  # what the converter does not know it leaves as it is
         raise PluginError(f"not all of this equation can be drawn: {html.unescape(latex)}")
-    return mathml
+    return f'<div class="equation">{mathml}</div>' if tag == "div" else mathml

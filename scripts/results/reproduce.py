@@ -2,6 +2,10 @@
 
     python scripts/results/reproduce.py TASK [NAME ...] [--seed 0] [--seeds 5] [--level 0.9] [--one-by-one]
                                          [--out FOLDER] [-- SETTINGS]
+    python scripts/results/reproduce.py ROW [ROW ...]
+
+A ROW is a file of results/ without its ending, such as ant_fall/gara: it is measured anew as its JSON says, with the
+same settings and seeds.
 
 TASK is a file of configs/ without its ending. A NAME is `star`, or a file of configs/agents, configs/ablations,
 configs/sgim or configs/paper laid over it, or several of these, as hiro+td3_tutor; by default all agents. SETTINGS are
@@ -11,14 +15,16 @@ results/TASK/one_by_one, go
 
     NAME.json     every seed's success on `--episodes` greedy episodes on test goals; env steps to success_any `--level`
                   (null: never), seconds of training to it, and seconds since the start of the run, with compilation
-                  and evaluations; of every program its seeds, command, commit, device and versions
+                  and evaluations; of every program its seeds, command, commit, device, versions and learning digest
+                  (scripts/results/digest.py)
     curves.jsonl  all evaluations during training
     curves.png    success_any over env steps and over wall-clock: mean over seeds, and their range if there are at most
                   five agents; where teachers may be asked also the share of episodes in which they are
     table.md      means over seeds with 95 % intervals, how many seeds have learnt the task, and each seed
 
-Seeds that a JSON already holds are not trained again. Runs are kept under `--runs`, those with other SETTINGS apart.
-One that was interrupted goes on, so empty that folder when code or configs have changed.
+Seeds that a JSON already holds with today's digest are not trained again; one of an older version is begun anew. Runs
+are kept under `--runs`, those with other SETTINGS or digests apart, and one that was interrupted goes on. So the same
+command ends what a lost machine began. `python scripts/results/page.py` then makes docs/results.md.
 """
 
 from __future__ import annotations
@@ -35,6 +41,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from scripts.results import digest
 from star.agent.episodes import MEASURES
 from star.report.statistics import above, over_seeds
 from star.training.journal import Journal, JsonLines
@@ -61,14 +68,30 @@ def layer(name: str) -> list[str]:
     return found
 
 
-def measure(
-    task: str, name: str, seeds: list[int], options: argparse.Namespace, settings: list[str], *, goals: str = "test"
-) -> dict[str, Any]:
-    """Train and evaluate the consecutive `seeds` of one agent in one program: metrics, evaluation, how it was run."""
-    other = [hashlib.sha256(shlex.join(settings).encode()).hexdigest()[:8]] if settings else []
-    run = options.runs / task / "-".join([name, *map(str, seeds), *other])
+def training(task: str, name: str, seeds: list[int], settings: list[str]) -> list[str]:
+    """Words after `star` that train the consecutive `seeds` of one agent in one program."""
     chosen = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), *settings]
-    train = ["train", f"configs/{task}.yaml", *layer(name), *chosen]
+    return ["train", f"configs/{task}.yaml", *layer(name), *chosen]
+
+
+def measure(
+    task: str,
+    name: str,
+    seeds: list[int],
+    options: argparse.Namespace,
+    settings: list[str],
+    *,
+    goals: str = "test",
+    version: str = "",
+) -> dict[str, Any]:
+    """Train and evaluate the consecutive `seeds` of one agent in one program: metrics, evaluation, how it was run.
+
+    Runs of another `version` of the agent are kept apart.
+    """
+    apart = shlex.join(settings) + version
+    other = [hashlib.sha256(apart.encode()).hexdigest()[:8]] if apart else []
+    run = options.runs / task / "-".join([name, *map(str, seeds), *other])
+    train = training(task, name, seeds, settings)
     if (run / "config.yaml").exists():  # interrupted, or done
         subprocess.run([*STAR, "train", "--resume", str(run)], cwd=ROOT, check=True)
     else:
@@ -85,7 +108,7 @@ def measure(
 def summarise(
     task: str, name: str, old: dict[str, Any], measured: dict[str, Any], *, level: float
 ) -> tuple[dict[str, Any], list]:
-    """What goes into an agent's JSON, the seeds of the `old` one included, and the new evaluations during training."""
+    """The content of an agent's JSON, the seeds of the `old` one included, and the new evaluations during training."""
     rows = measured["rows"]
     curve = [
         {"name": name} | {k: v for k, v in row.items() if k in CURVE or k.startswith("sgim/")}
@@ -208,7 +231,39 @@ def _asked(curves: list[dict[str, Any]], name: str) -> dict[int, float]:
     return {step: float(np.mean(values)) for step, values in sorted(shares.items())}
 
 
+def again(row: str) -> list[str]:
+    """Arguments of this script that measure a row of results/ anew; SystemExit if there is no such row."""
+    path = ROOT / "results" / f"{row}.json"
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+        runs, seeds = report["runs"], sorted(seed["seed"] for seed in report["seeds"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise SystemExit(f"error: {row}: results/{row}.json is no row of results") from None
+    words = shlex.split(runs[-1]["command"])[2:]
+    settings = [word for i, word in enumerate(words) if not _told_by_us(words, i)]
+    alone = ["--one-by-one"] * all(len(run["seeds"]) == 1 for run in runs)
+    level = ["--level", str(report.get("level", LEVEL)), "--episodes", str(report["seeds"][0]["episodes"])]
+    which = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), "--out", str(path.parent)]
+    return [report["task"], report["name"], *which, *level, *alone, "--", *settings]
+
+
+def _told_by_us(words: list[str], place: int) -> bool:
+    """True if the word of a command at `place` is the config, or a layer, or says which seeds."""
+    ours = ("--with", "--seed", "--seeds")
+    return place == 0 or words[place] in ours or words[place - 1] in ours
+
+
 def main(arguments: list[str] | None = None) -> None:
+    """Measure agents of one task, or rows anew."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given and "/" in given[0]:
+        for row in given:
+            fill(again(row))
+    else:
+        fill(given)
+
+
+def fill(given: list[str]) -> None:
     """Fill the folder of one task."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
@@ -223,7 +278,6 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path)
     parser.add_argument("--commit", help="what to record where there is no git")
     parser.add_argument("--runs", type=Path, default=Path("runs/reproduce"))
-    given = sys.argv[1:] if arguments is None else arguments
     end = given.index("--") if "--" in given else len(given)
     options, settings = parser.parse_intermixed_args(given[:end]), given[end + 1 :]
     if not (ROOT / "configs" / f"{options.task}.yaml").is_file():
@@ -238,15 +292,21 @@ def main(arguments: list[str] | None = None) -> None:
     for name in options.names:
         path = out / f"{name}.json"
         report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        today = digest.of(shlex.join(["star", *training(options.task, name, [options.seed], settings)]))
+        if not all(digest.same(program.get("digest"), today) for program in report.get("runs", [])):
+            print(f"{path}: of an older version, begun anew", flush=True)
+            report = {}
         level = report.get("level", LEVEL) if report else options.level
         if level != options.level:
             raise SystemExit(f"error: --level {options.level:g}: {path} was made with {level:g}")
         wanted = range(options.seed, options.seed + options.seeds)
         missing = sorted(set(wanted) - {seed["seed"] for seed in report.get("seeds", [])})
         for seeds in groups(missing, one_by_one=options.one_by_one):
-            measured = measure(options.task, name, seeds, options, settings)
+            measured = measure(options.task, name, seeds, options, settings, version=json.dumps(today))
+            measured["run"]["digest"] = today
             report, curve = summarise(options.task, name, report, measured, level=options.level)
-            kept = [point for point in record.read() if point["name"] != name or point["seed"] not in seeds] + curve
+            there = {seed["seed"] for seed in report["seeds"]} - set(seeds)
+            kept = [point for point in record.read() if point["name"] != name or point["seed"] in there] + curve
             record.path.write_text("".join(json.dumps(point) + "\n" for point in kept), encoding="utf-8")
             path.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
     curves = record.read()

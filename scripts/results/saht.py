@@ -77,7 +77,7 @@ OF_WORLD = {
 
 
 class Claim(NamedTuple):
-    """What was claimed, what was found, and whether it holds."""
+    """A claim, the finding, and True if it holds."""
 
     row: str
     """The letter of the claim in docs/saht.md."""
@@ -90,7 +90,7 @@ class Claim(NamedTuple):
 
 
 def trained(world: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
-    """What a run of the algorithm has measured; it is made, or gone on with, if need be."""
+    """The measurements of a run of the algorithm; it is made, or gone on with, if need be."""
     run = options.runs / _stem(world, options.noise) / name
     words = [*ALGORITHMS[name], "--world.name", world, "--seeds", str(options.seeds)]
     words += ["--total-env-steps", str(options.total), "--trainer.checkpoint_every", "1000"]
@@ -109,7 +109,7 @@ def _stem(world: str, noise: float) -> str:
 
 
 def _done(run: Path, total: int) -> bool:
-    """Whether the run has been trained, and was evaluated at its end."""
+    """True if the run has been trained, and was evaluated at its end."""
     rows = Journal.of(run, tables="practice").metrics.read()
     return bool(rows) and rows[-1]["env_steps"] >= total and "eval/error" in rows[-1]
 

@@ -42,7 +42,7 @@ TUTORS = {
 
 
 def taught(name: str, settings: dict[str, Any], folder: Path, *, seed: int, graphs: int) -> dict[str, Any]:
-    """What one tutor made of the students of all graphs."""
+    """One tutor's results with the students of all graphs."""
     config, own = TUTORS[name]
     settings = {"trainer.seed": seed, "trainer.num_seeds": graphs} | own | settings
     began, run = time.monotonic(), folder / name.replace(", ", "-").replace(" ", "_")
@@ -66,7 +66,7 @@ def taught(name: str, settings: dict[str, Any], folder: Path, *, seed: int, grap
 
 
 def discovered(found: dict[str, Any]) -> dict[str, Any]:
-    """How good the graphs are that a tutor found, each and all of their edges together."""
+    """Quality of the graphs that a tutor found, each and all of their edges together."""
     tables = found.pop("tables")
     true, known = ([{tuple(edge[:2]) for edge in row[key]} for row in tables] for key in ("prerequisites", "found"))
     hits = [len(a & b) for a, b in zip(true, known, strict=True)]
@@ -76,7 +76,7 @@ def discovered(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def claims(level: dict[str, np.ndarray], graphs: dict[str, Any]) -> list[tuple[str, str, bool]]:
-    """What is to be shown, what was found, and whether it holds."""
+    """The claims, the findings, and True where they hold."""
     rows = []
     for key, least in (("precision", 0.65), ("recall", 0.75), ("auc", 0.85)):
         value = np.asarray(graphs["each"][key], float)

@@ -1,4 +1,4 @@
-"""Where a region is cut of which only a part reaches another: between the leaves that do and those that do not."""
+"""The cut of a region of which only a part reaches another: between the leaves that do and those that do not."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def remembered(state: ForwardModelState) -> Outcome:
 
 
 def traffic(state: ForwardModelState, abstraction: Abstraction) -> Float[Array, "R R"]:
-    """How many of the periods in the buffer began in each region (row) and ended in each (column)."""
+    """Number of periods in the buffer that began in each region (row) and ended in each (column)."""
     periods = remembered(state)
     began, ended = (regions.locate(abstraction, point) for point in (periods.start, periods.end))
     none = jnp.zeros((abstraction.capacity, abstraction.capacity))

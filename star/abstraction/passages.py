@@ -1,4 +1,4 @@
-"""Where a region falls apart: a plane through it that agents do not pass.
+"""The place at which a region falls apart: a plane through it that agents do not pass.
 
 A wall through a region makes two places of it that look like one. Plans then go in at the one and come out at the
 other. It shows in two ways.
@@ -126,13 +126,13 @@ def _part(abstraction: Abstraction, region: Int[Array, "N"], point: Float[Array,
 def _count(
     abstraction: Abstraction, region: Int[Array, "N"], parts: Parts, weight: Float[Array, "N"]
 ) -> Float[Array, "R d parts"]:
-    """How many are in each part."""
+    """Count in each part."""
     capacity, d = abstraction.lower.shape
     return jnp.zeros((capacity, d, PLANES)).at[region[:, None], jnp.arange(d), parts].add(weight[:, None])
 
 
 def _below(abstraction: Abstraction, region: Int[Array, "N"], parts: Parts, weight: Float[Array, "N"]) -> Planes:
-    """How many are in parts below each plane."""
+    """Count in the parts below each plane."""
     return jnp.cumsum(_count(abstraction, region, parts, weight), axis=-1)[..., :-1]
 
 
@@ -156,7 +156,7 @@ def _free(abstraction: Abstraction, periods: Outcome, goals: Outcome) -> Bool[Ar
 
 
 def _room(free: Bool[Array, "R d parts"]) -> Int[Array, "R d planes"]:
-    """How many parts there are from each plane to the nearest `free` one, below PLANES / 2."""
+    """Number of parts from each plane to the nearest `free` one, below PLANES / 2."""
     index = jnp.arange(PLANES)
     under = jax.lax.cummax(jnp.where(free, index, -1), axis=2)[..., :-1]
     over = jax.lax.cummin(jnp.where(free, index, PLANES), axis=2, reverse=True)[..., 1:]

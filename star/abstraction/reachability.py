@@ -226,7 +226,7 @@ def summary(leaves: Leaves) -> Int[Array, ""]:
 
 
 def reaches_where_visited(leaves: Leaves) -> Bool[Array, ""]:
-    """Whether there are visited leaves and all of them reach."""
+    """True if there are visited leaves and all of them reach."""
     return leaves.visited.any() & (leaves.reaches | ~leaves.visited).all()
 
 
@@ -235,6 +235,6 @@ def _visits(part: Int[Array, "N"], counted: Float[Array, "N"], parts: int) -> Fl
 
 
 def _halving(network: Network, lower: Float[Array, "d"], upper: Float[Array, "d"]) -> tuple[Array, Array]:
-    """Where a box is halved: its dimension of largest smear, and the middle of that."""
+    """The plane that halves a box: its dimension of largest smear, and the middle of that."""
     dimension = jnp.argmax(smear(network, lower, upper))
     return dimension, (lower[dimension] + upper[dimension]) / 2

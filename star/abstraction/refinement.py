@@ -51,7 +51,7 @@ class Settings(Protocol):
 
     @property
     def forward_model(self) -> ForwardModelConfig:
-        """What predicts where commands lead."""
+        """The model that predicts the ends of commands."""
 
     @property
     def refinement(self) -> RefinementConfig:
@@ -59,7 +59,7 @@ class Settings(Protocol):
 
 
 class Graph(struct.PyTreeNode):
-    """What is known of every ordered pair of regions (row: start, column: target)."""
+    """Knowledge of every ordered pair of regions (row: start, column: target)."""
 
     verdict: Int[Array, "R R"]
     age: Int[Array, "R R"]
@@ -269,13 +269,13 @@ def on_split(graph: Graph, split: Split) -> Graph:
 
 
 def reached(goals: Outcome, cube: float | Array) -> Bool[Array, "N"]:
-    """Whether the goals, boxes that were commanded, were reached: within `cube` units of each coordinate."""
+    """True if the goals, boxes that were commanded, were reached: within `cube` units of each coordinate."""
     away = jnp.maximum(goals.lower - goals.end, goals.end - goals.upper)
     return jnp.all(away <= _widening((goals.upper - goals.lower) / 2, cube), axis=-1)
 
 
 def _widening(half: Float[Array, "*n d"], cube: float | Array) -> Float[Array, "*n d"]:
-    """What a box of half-widths `half` lacks to a cube of half-width `cube`."""
+    """The gap from a box of half-widths `half` to a cube of half-width `cube`."""
     return jnp.maximum(cube - half, 0.0)
 
 

@@ -66,7 +66,7 @@ class Split(struct.PyTreeNode):
 
 
 class Change(struct.PyTreeNode):
-    """What became of the regions between two episodes: all that has a table of them follows it."""
+    """The change of the regions between two episodes: all that has a table of them follows it."""
 
     before: Abstraction
     after: Abstraction
@@ -185,7 +185,7 @@ def split(abstraction: Abstraction, cut: Cut, *, min_width: float | Array) -> tu
 
 
 def coarse(abstraction: Abstraction, share: float | Array) -> Bool[Array, "R"]:
-    """Which regions are at least `share` times as large as each would be that is left, spread over the whole space.
+    """Mask of regions at least `share` times as large as each would be that is left, spread over the whole space.
 
     The fewer are left, the larger they have to be; with none left, none is coarse but for a `share` of 0.
     """
@@ -194,7 +194,7 @@ def coarse(abstraction: Abstraction, share: float | Array) -> Bool[Array, "R"]:
 
 
 def adjacent(abstraction: Abstraction) -> Bool[Array, "R R"]:
-    """Which active regions share a face; none is its own neighbour."""
+    """Mask of active regions that share a face; none is its own neighbour."""
     lower = jnp.maximum(abstraction.lower[:, None], abstraction.lower[None])
     upper = jnp.minimum(abstraction.upper[:, None], abstraction.upper[None])
     faces = jnp.all(lower <= upper, axis=-1) & (jnp.sum(lower < upper, axis=-1) == lower.shape[-1] - 1)

@@ -51,7 +51,7 @@ class RefinementConfig(Section):
     """When and where a region is split."""
 
     enabled: bool = setting(True, "With false the initial regions stay.")
-    within: bool = setting(True, "Whether a region reaches the goals inside it is examined, too.")
+    within: bool = setting(True, "The reach of a region to the goals inside it is examined, too.")
     neighbours: bool = setting(
         True, "A region is cut only for targets that touch it; others are reached by way of these."
     )

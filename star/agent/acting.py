@@ -56,7 +56,7 @@ class _Functions(NamedTuple):
 
 @dataclass
 class _Episode:
-    """Where the hierarchy stands in the episodes of B bodies, after `steps` env steps.
+    """State of the hierarchy in the episodes of B bodies, after `steps` env steps.
 
     `before` is the last observation [B, n], and `shape` its leading axes as they were given: [] or [B].
     """
@@ -81,7 +81,7 @@ class TrainedAgent:
         self.seed = seed
         """The one that it was trained with."""
         self.spec: Spec = program.experiment.tested_spec
-        """What it knows of the task: sizes, and which entries of the state positions and goals are."""
+        """Its knowledge of the task: sizes, and which entries of the state positions and goals are."""
         self._functions = _Functions.of(self.spec)
         self._episode: _Episode | None = None
         self.reset()
@@ -166,7 +166,7 @@ class TrainedAgent:
 
     @property
     def subgoal(self) -> Float[np.ndarray, "*batch m"] | None:
-        """Where the Controller is going after the last `act`, relative to the body; None before the first.
+        """The Controller's aim after the last `act`, relative to the body; None before the first.
 
         Points are displacements [p] in units of the state. Without a Tutor it is the lower and the upper corner [2d]
         of the target box.

@@ -135,7 +135,7 @@ def price(section: TutorConfig, task: Task, state: AdjacencyState | None) -> Pen
 def penalty(
     config: AdjacencyConfig, state: AdjacencyState, start: Float[Array, "N d"], subgoal: Float[Array, "N d"]
 ) -> Float[Array, "N"]:
-    """What relative subgoals beyond the reach of psi add to the loss of the Tutor's actor."""
+    """Loss of the Tutor's actor from relative subgoals beyond the reach of psi."""
     apart = _distance(config, state.params, start, start + subgoal)
     return config.weight * jnp.maximum(apart - config.limit, 0.0)
 

@@ -1,4 +1,4 @@
-"""What is learnt of the regions between two episodes, once all periods of the epoch are known.
+"""Learning about the regions between two episodes, once all periods of the epoch are known.
 
     forward model    learns from the epoch's complete periods, after its error on them was measured
     refinement       examines pairs of regions and cuts some

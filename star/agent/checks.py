@@ -1,4 +1,4 @@
-"""Whether settings fit the task: what cannot be seen from the settings alone."""
+"""Checks of settings against the task, beyond the settings alone."""
 
 from __future__ import annotations
 

@@ -7,8 +7,8 @@
     observe     the decisions of an instant, by `planning` or `q_learning`
     follow      once an epoch: the regions may have been cut
 
-A share of the environments practises: they pursue random regions instead of the goal. What is hard to reach, and so
-unattractive to all others, is tried there.
+A share of the environments practises: they pursue random regions instead of the goal. Goals hard to reach, and so
+unattractive to all others, are tried there.
 
 Greedy episodes explore nothing, remember which commands led back or nowhere, and decide again as soon as a target is
 reached. After a command in vain the Tutor draws its subgoals as in training, for what it would choose again is known
@@ -45,7 +45,7 @@ _RULES = {"model": planning, "q": q_learning}
 
 
 def _rule(section: CommanderConfig) -> ModuleType:
-    """How it learns from decisions."""
+    """Its learning from decisions."""
     return _RULES[section.learner]
 
 
@@ -177,7 +177,7 @@ def _worth_by_now(
     region: Int[Array, "B"],
     goal_region: Int[Array, "B"],
 ) -> Float[Array, "B R"]:
-    """What is left of the value of each command in `region`, from 0 to 1, after what it did in this episode.
+    """The rest of the value of each command in `region`, from 0 to 1, after what it did in this episode.
 
     Where it led out, that was in vain, as the agent is there again: `retry` for each time. Where it did not, that was
     bad luck, of a known chance s each time, or the command does not work from here. With `trust` = h, the chance that
@@ -228,12 +228,12 @@ def tick(section: CommanderConfig, memory: Memory, *, steps: int) -> Memory:
 
 
 def renewed(memory: Memory) -> Bool[Array, "B"]:
-    """Where another target follows."""
+    """True where another target follows."""
     return memory.clock == 0
 
 
 def in_vain(memory: Memory, success: Float[Array, "B"]) -> Bool[Array, "B"]:
-    """Where the command before this one did not lead out of the region, in greedy episodes, and not to the goal."""
+    """True where the last command of a greedy episode led neither out of the region nor to the goal."""
     if memory.past is None:
         return jnp.zeros(len(success), bool)
     return (memory.past[:, -1, 0] == memory.region) & (memory.past[:, -1, 2] == 0) & (success == 0)
@@ -326,7 +326,7 @@ def lost_reward(section: CommanderConfig, reward: Float[Array, "B"], last: Float
 
 
 def start_reward(section: CommanderConfig) -> float:
-    """What the reward of a period is accumulated from."""
+    """The terms of a period's reward."""
     return -jnp.inf if section.reward == "max" else 0.0
 
 

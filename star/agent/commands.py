@@ -56,7 +56,7 @@ def measure(run_dir: Path, overrides: Mapping[str, Any], *, checkpoint: str, see
 
 
 def _goals(options: argparse.Namespace) -> dict[str, Any]:
-    """Which goals, as an `Exam` has them."""
+    """The goals, as an `Exam` has them."""
     if options.goals != "grid" and options.grid is not None:
         raise ConfigError("--grid: needs --goals grid")
     return {"grid": (options.grid or 8) if options.goals == "grid" else None, "training": options.goals == "train"}

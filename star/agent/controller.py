@@ -76,7 +76,7 @@ def act(
 
 
 def policy(section: ControllerConfig, task: Task, state: Any, *, key: Array) -> Policy:
-    """What it does in states [..., state] under subgoals [..., m], without exploration."""
+    """Its actions in states [..., state] under subgoals [..., m], without exploration."""
 
     def actions(states: Array, subgoals: Array) -> Array:
         return act(section, state, observe(section, task, states, subgoals), explore=False, key=key)
@@ -87,7 +87,7 @@ def policy(section: ControllerConfig, task: Task, state: Any, *, key: Array) -> 
 def experience(
     section: ControllerConfig, task: Task, segment: Segment, *, env_steps: Float[Array, ""] | float
 ) -> Transition:
-    """What a segment teaches, [l, B]; `env_steps` are those of all environments before the epoch."""
+    """The transitions of a segment, [l, B]; `env_steps` are those of all environments before the epoch."""
     last = jnp.zeros_like(segment.alive).at[-1].set(1.0)
     before, after = segment.subgoal[:-1], segment.subgoal[1:]
     lost = price(section, task.spec, segment.obs[1:], segment.terminated, env_steps=env_steps)
@@ -133,7 +133,7 @@ def price(
     *,
     env_steps: Float[Array, ""] | float,
 ) -> Float[Array, "*batch"]:
-    """What is taken off the reward of an env step that led to `next_obs`, whatever the subgoal is.
+    """Penalty on the reward of an env step that led to `next_obs`, whatever the subgoal is.
 
     The share of `tilt_penalty` rises exponentially over the first `tilt_steps` of `env_steps`, those of all
     environments together.
@@ -146,7 +146,7 @@ def price(
 
 
 def _later(task: Task, segment: Segment) -> Float[Array, "l B 2 p"]:
-    """Where the agent was at the end of the segment, seen from before and from after each of its env steps."""
+    """Place of the agent at the end of the segment, seen from before and from after each of its env steps."""
     pose = task.spec.pose(segment.obs)
     return jnp.stack([pose[-1] - pose[:-1], pose[-1] - pose[1:]], axis=-2)
 

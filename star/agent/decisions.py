@@ -1,6 +1,6 @@
-"""What the Commander decides: its memory of the period under way, and what finished ones were.
+"""The Commander's decisions: its memory of the period under way, and the finished ones.
 
-What it chooses from is the `Roadmap`: today's regions, and which may follow which.
+It chooses from the `Roadmap`: today's regions, and which may follow which.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ ANY = 1_000_000  # a region to practise that is still to be drawn; larger than a
 
 
 class Memory(struct.PyTreeNode):
-    """Where each of the B environments stands in its Commander period."""
+    """State of each of the B environments in its Commander period."""
 
     clock: Int[Array, "B"]
     """Env steps since the period began."""
     practice: Int[Array, "B"]
     """The region that an environment practises to reach; -1 where it pursues the goal of the task."""
     region: Int[Array, "B"]
-    """Where the period began; -1 before the first."""
+    """Region in which the period began; -1 before the first."""
     goal_region: Int[Array, "B"]
     target: Int[Array, "B"]
     box: Box
     start: Float[Array, "B d"]
     reward: Float[Array, "B"]
     aside: Bool[Array, "B"]
-    """Whether the box is that around a waypoint, not the target region or the goal's."""
+    """True if the box is that around a waypoint, not the target region or the goal's."""
     past: Int[Array, "B N 3"] | None = None
     """In greedy episodes the last decisions: region, target, and 1 where the region was left, else 0; -1 before."""
 
@@ -65,7 +65,7 @@ class Decision(struct.PyTreeNode):
 
     @property
     def at_goal(self) -> Bool[Array, "N"]:
-        """Whether the Tutor was given the goal, not the bounds of a region."""
+        """True if the Tutor was given the goal, not the bounds of a region."""
         return (self.target == self.goal_region) & (self.practised == 0) & (self.aside == 0)
 
 
@@ -77,7 +77,7 @@ class Finished(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What the Commander sees of the environments."""
+    """The Commander's view of the environments."""
 
     position: Float[Array, "B d"]
     goal: Float[Array, "B d"]
@@ -86,7 +86,7 @@ class Scene(NamedTuple):
 
 
 class Successors(struct.PyTreeNode):
-    """Which targets may follow a region: `greedy` for the best choice, `explore` for the random one.
+    """Mask of the targets that may follow a region: `greedy` for the best choice, `explore` for the random one.
 
     Besides, the region of a goal, or one that is practised, may always follow itself.
     """
@@ -114,7 +114,7 @@ class Roadmap(struct.PyTreeNode):
         *,
         attraction: Float[Array, "R"] | None = None,
     ) -> Roadmap:
-        """What `graph` says of the regions, under `commander.successors`."""
+        """The roadmap of `graph`, under `commander.successors`."""
         allowed = successors(section.successors, reaches=graph.reaches, misses=graph.misses, active=abstraction.active)
         believed = regions.adjacent(abstraction) & (graph.told >= 0)
         if section.successors != "all":

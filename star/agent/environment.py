@@ -52,7 +52,7 @@ def _factory(name: str) -> Callable[..., Any]:
 
 
 def _made(name: str, engine: str, options: dict[str, Any]) -> Any:
-    """What the user's function makes."""
+    """The environment that the user's function makes."""
     factory = _factory(name)
     if engine != "auto":
         if not plugins.takes(factory, "engine"):

@@ -61,7 +61,7 @@ def summarise(episode: Episode) -> dict[str, Any]:
 
 
 def summarise_way(trials: Trials, shortest: np.ndarray | None, *, dt: float, length: int) -> dict[str, Any]:
-    """What it takes to reach the goal: `steps_to_goal`, `seconds_to_goal`, `path_length` (m), `stayed` and `spl`.
+    """The cost of reaching the goal: `steps_to_goal`, `seconds_to_goal`, `path_length` (m), `stayed` and `spl`.
 
     `stayed` is the share of the env steps from the first arrival on that are at the goal, in episodes of `length` env
     steps. All but `spl` are means over the episodes that reach it, with Student's t intervals, None if none does.
@@ -88,7 +88,7 @@ def summarise_way(trials: Trials, shortest: np.ndarray | None, *, dt: float, len
 
 
 def failures(trials: Trials) -> dict[str, int]:
-    """How many episodes never reached their goal, by the reason in `FAILURES`."""
+    """Count of episodes that never reached their goal, by the reason in `FAILURES`."""
     failure = np.ravel(trials.failure)
     return {name: int((failure == number).sum()) for number, name in enumerate(FAILURES)}
 

@@ -8,7 +8,7 @@
             every `unroll` segments: Tutor learns
         between episodes: forward model, refinement, and what follows of them
 
-Which levels there are, `star.agent.levels` says: no Commander is HIRO, no Tutor is GARA, neither is flat.
+`star.agent.levels` chooses the levels: no Commander is HIRO, no Tutor is GARA, neither is flat.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def _segment(
 
 
 def _counts(passed: Segment) -> Metrics:
-    """How often episodes ended, and by what, and how many observations were not finite."""
+    """Counts of ended episodes by their reason, and of observations that were not finite."""
     finite = jnp.isfinite(passed.obs).all(axis=-1)
     counted: Mapping[str, Array] = {
         "terminated": passed.terminated,

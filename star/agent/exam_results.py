@@ -1,4 +1,4 @@
-"""What evaluations come to: groups of runs compared, and rows and figures written into a folder.
+"""Results of evaluations: groups of runs compared, and rows and figures written into a folder.
 
 compare   groups of runs, by the last checkpoint of each that was evaluated
 write     the rows and figures, into a folder

@@ -85,7 +85,7 @@ def groups(found: Sequence[Row]) -> Table:
 
 
 def improvements(found: Sequence[Row]) -> Table:
-    """How much better one group is than another; each pair once, in the order of the groups."""
+    """Differences between groups; each pair once, in the order of the groups."""
     table = Table(box=box.SIMPLE_HEAD, title="difference of means A - B, 95 % intervals (Welch), and P(A > B) of seeds")
     if any(pair["success_any"] is None for pair in found):
         table.caption = "-: no task in common"

@@ -41,7 +41,7 @@ FAILED = 10  # episodes that failed, named for each seed
 
 @dataclass(frozen=True)
 class Exam:
-    """What agents are to do: with `grid` N on a grid of N x N goals, else on those of tests, or of `training`.
+    """The exam of agents: with `grid` N on a grid of N x N goals, else on those of tests, or of `training`.
 
     `seed` chooses starts and goals. `task` are dotted settings of the task, `env.name` and `env.options`, where they
     are not to be those of training.
@@ -71,7 +71,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Course:
-    """What agents of one structure are evaluated on. `program` is that of their training.
+    """The course on which agents of one structure are evaluated. `program` is that of their training.
 
     `options` are those of the task. `goals` [E, k] are the goals of the episodes, None if the task draws them, and
     `cells` [G, 4] the rectangles that they are the middles of, one after another.
@@ -119,7 +119,7 @@ def elsewhere(config: Config, task: Mapping[str, Any]) -> Config:
 
 
 def _fitting(program: Program, env: Any, *, source: Path) -> Spec:
-    """What the levels trained by `program` know of `env`: their own space and subgoals, and where its goals are."""
+    """The spec of `env` for levels trained by `program`: their own space and subgoals, and its goals."""
     trained, here = program.experiment.spec, Spec.of(env, heading=program.experiment.spec.heading)
     for words, name in (("a state of", "state_dim"), ("actions of", "action_size")):
         here_size, trained_size = getattr(here, name), getattr(trained, name)
@@ -146,7 +146,7 @@ def _goals(env: Any, middles: np.ndarray) -> np.ndarray:
 
 
 def _xy(indices: Sequence[int]) -> list[int]:
-    """Where x and y, the first two numbers of a state, are among `indices`."""
+    """Places of x and y, the first two numbers of a state, among `indices`."""
     return [indices.index(0), indices.index(1)]
 
 
@@ -169,7 +169,7 @@ def player(course: Course, episodes: int) -> Callable[[Any, Any, jax.Array], Tri
 
 
 def measure(ended: Episode, position: jax.Array, success: jax.Array, *, goal: jax.Array, radius: float) -> Trials:
-    """What E episodes took, from `position` [T + 1, E, d] and `success` [T + 1, E] at every moment.
+    """Steps and paths of E episodes, from `position` [T + 1, E, d] and `success` [T + 1, E] at every moment.
 
     As in the statistics of episodes, the moment before the first step does not count as success. A body is
     stuck that stays within `radius` of its end for the last half of the time.
@@ -265,7 +265,7 @@ def _plan(targets: Sequence[Target], exam: Exam, stack: contextlib.ExitStack) ->
 
 
 def _structure(config: Config) -> Any:
-    """What two runs have in common that can be evaluated with one compiled function: all but numbers and seeds."""
+    """The common part of runs that one compiled function evaluates: all but numbers and seeds."""
     env = json.dumps(config.env.model_dump(mode="json"), sort_keys=True)
     return jax.tree.structure(config.hyper()), env, config.trainer.num_envs, config.trainer.eval_episodes
 

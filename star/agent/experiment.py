@@ -41,7 +41,7 @@ class Star(Experiment):
     def __init__(self, config: Config) -> None:
         env, test_env = (environment.make(config, goals) for goals in ("train", "test"))
         self.spec = Spec.of(env, heading=config.tutor.heading if config.tutor.enabled else None)
-        """What the levels know of the environment."""
+        """The levels' knowledge of the environment."""
         super().__init__(resolve(config, environment.engine_of(config, env), self.spec))
         config = self.config
         try:
@@ -71,7 +71,7 @@ class Star(Experiment):
         return resolve(config, self.config.env.engine, self.spec)
 
     def data(self) -> tuple[Demonstrations, ...]:
-        """What the teachers show."""
+        """The teachers' demonstrations."""
         config = self.config
         return tuple(_demonstrations(config, one, self.env, self.test_env, self.spec) for one in config.sgim.teachers)
 
@@ -134,7 +134,7 @@ class Star(Experiment):
         return found
 
     def placement(self, state: TrainState, mesh: Mesh | None, whole: TrainState) -> TrainState:
-        """What the learners of levels cut in shares; all else is whole."""
+        """The parts that learners of levels cut in shares; all else is whole."""
 
         def of(axis: int) -> Any:
             return devices.everywhere(mesh) if axis == learners.WHOLE else devices.in_shares(mesh, axis=1 + axis)
@@ -166,7 +166,7 @@ def resolve(config: Config, engine: str, spec: Spec) -> Config:
 
 
 def _demonstrations(config: Config, teacher: TeacherConfig, env: Any, tested: Any, spec: Spec) -> Demonstrations:
-    """What a teacher shows; raises `UserError` if that is not what it should be."""
+    """The demonstrations of a teacher; raises `UserError` if they are wrong."""
     if teacher.source == "map":
         goal_env.need(env, "a teacher by map", "arena")
         demos = teachers.shortest_paths(env)

@@ -42,7 +42,7 @@ WIDE = 16 / 9  # the shape that several tiles together come near to
 
 @dataclass(frozen=True)
 class Show:
-    """What to draw: `envs` environments for `steps` env steps (None: the episode), every `every`th of them.
+    """The picture to draw: `envs` environments for `steps` env steps (None: the episode), every `every`th of them.
 
     `camera` None is `overview` in a still and `follow` in a film; `height` None goes by the number of environments.
     """
@@ -204,7 +204,7 @@ def record_run(
 
 
 def moments_shown(total: int, show: Show) -> list[int]:
-    """Which of `total` moments are drawn: the last one for a still, else every `every`th and the last one."""
+    """The moments that are drawn, of `total`: the last one for a still, else every `every`th and the last one."""
     if video.is_still(show.out):
         return [total - 1]
     return sorted({*range(0, total, show.every), total - 1})
@@ -251,7 +251,7 @@ def _tile(
 
 
 def _look(env: Any, state: Any) -> Moments:
-    """What to keep of the environments [N] of `state`."""
+    """The kept part of the environments [N] of `state`."""
     qpos, mocap_pos = jax.vmap(env.pose)(state.pipeline_state.data)
     return Moments(
         qpos=qpos,

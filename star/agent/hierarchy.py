@@ -66,7 +66,7 @@ def decide(
 
 
 def observe(agent: Agent, obs: Float[Array, "B obs"], subgoal: Float[Array, "B m"]) -> Float[Array, "B seen"]:
-    """What the Controller sees."""
+    """The Controller's view."""
     return agent.controller.observe(agent.config.controller, agent.task, agent.task.spec.state(obs), subgoal)
 
 

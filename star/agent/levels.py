@@ -1,4 +1,4 @@
-"""Which levels an agent has: all of them, or others in their place. The one place where this is chosen."""
+"""The levels of an agent: all of them, or others in their place. The one place where this is chosen."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Agent(NamedTuple):
     guide: ModuleType
     """`lessons`, or `unguided` without SGIM and in greedy episodes."""
     between_episodes: Callable
-    """What is learnt of the regions; nothing without a Commander."""
+    """Learning about the regions; nothing without a Commander."""
 
 
 def of(config: AgentConfig, spec: Spec, *, greedy: bool = False) -> Agent:

@@ -1,4 +1,4 @@
-"""How checkpoints of older formats become what this version reads: from each format to the next one.
+"""Conversion of checkpoints of older formats: from each format to the next one.
 
 Whoever changes what is saved adds one to `FORMAT`, a row to `TO_NEXT` and, under `tests/data`, a run of the old format.
 """

@@ -1,4 +1,4 @@
-"""What a run lacks, in one line each: room for regions, or new ground.
+"""Needs of a run, in one line each: room for regions, or new ground.
 
 Drawn from rows of metrics alone, so that a run says it while it goes on, and the report afterwards.
 """
@@ -16,7 +16,7 @@ _EVALUATIONS = 3
 
 
 def notices(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """What the rows of one seed so far say, by what it is about; the rows have `env_steps` and those of `KEYS`."""
+    """Notices from the rows of one seed so far, by their subject; the rows have `env_steps` and those of `KEYS`."""
     found = {}
     full = next((row for row in rows if row.get("refinement/table_full") == 1), None)
     if full is not None:

@@ -1,18 +1,17 @@
 """Planning on a learnt model of the regions, the Commander's default learner.
 
-Where the command of a region leads does not depend on the goal, so decisions teach about all other goals. Counts of
+The end of a region's command does not depend on the goal, so decisions teach about all other goals. Counts of
 (i, j) -> i' and mean rewards make a model of the regions, on which value iteration runs once a period:
 
     Q[i, g, j] <- r[i, g, j] + gamma sum_i' P(i' | i, j) max_j' Q[i', g, j']
 
 Commanding the goal's own region is another thing, for the Tutor is then given the goal: P(i' | i, g) is counted apart,
 and believed to be as where the goal is elsewhere.
-The probabilities of i' sum to less than 1 where episodes were lost (terminated). What was not tried is believed to
+The probabilities of i' sum to less than 1 where episodes were lost (terminated). An untried command is believed to
 succeed: a command leads to its target if the graph says so or the boxes touch, and who aims at a goal within his own
-region gets there. This belief weighs `prior` decisions, and e^(-n / prior) of that after n decisions. Where regions
-were cut, the epoch's decisions are counted anew by today's regions, and older ones are shared out by where periods
-began and ended (`follow`). Greedy episodes, in which nothing is learnt, follow a plan with hardly any belief
-(`settle`).
+region gets there. This belief weighs `prior` decisions, and e^(-n / prior) of that after n decisions. After cuts of
+regions, the epoch's decisions are counted anew by today's regions, and older ones are shared out by where periods began
+and ended (`follow`). Greedy episodes, in which nothing is learnt, follow a plan with hardly any belief (`settle`).
 
 Those who practise pursue a region by the same plan with another reward, 1 in the region pursued.
 
@@ -183,7 +182,7 @@ def recounted(
 def _counted(model: Model, batch: Decision, *, cells: Decision) -> Model:
     """`model` with the decisions of `batch`, in the tables' cells that the regions of `cells` say."""
     direct = 1 - batch.aside
-    # Who practises and aims at the goal's region aims at its centre, which tells nothing of aiming at the goal.
+    # Practising agents aim at the centre of the goal's region, which tells nothing of aiming at the goal.
     beside = batch.practised * (batch.target == batch.goal_region)
     telling = jnp.maximum(batch.weight, batch.lost) * direct * (1 - beside)
     command = (batch.at_goal.astype(jnp.int32), cells.region, cells.target)
@@ -215,7 +214,7 @@ def _expectations(
 
 
 def _weight_of_belief(section: CommanderConfig, number: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """What belief in a command weighs, in decisions, after a `number` of them.
+    """Weight of the belief in a command, in decisions, after a `number` of them.
 
     It fades faster than its share in a mean would. Who may try again and again needs no more than a small chance to
     find the way through a wall better than the long one around it.
@@ -281,7 +280,7 @@ def _inherited(
 
 
 def _beside(origin: Int[Array, "R"]) -> Bool[Array, "R R"]:
-    """Which regions are parts of the same one, and not the same."""
+    """Mask of pairs of regions that are parts of one older region."""
     return (origin[:, None] == origin) & ~jnp.eye(len(origin), dtype=bool)
 
 

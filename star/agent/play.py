@@ -78,7 +78,7 @@ class Streams(struct.PyTreeNode):
 
 
 Record = Callable[[EnvState, Array, Box, Array], Any]
-"""What to keep of an env step, given the B environments before it, subgoals [B, m], target boxes, actions [B, act]."""
+"""The kept part of an env step, given the B environments before it, subgoals [B, m], target boxes, actions [B, act]."""
 
 
 def evaluate(config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, *, key: Array) -> Episode:

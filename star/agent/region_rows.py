@@ -53,7 +53,7 @@ def of(
 
 @partial(jax.jit, static_argnames="episode_length")
 def _tables(config: AgentConfig, goal: Array, states: TrainState, episode_length: int) -> dict[str, Array]:
-    """What is known of each region of every seed, leading axes [seeds, R]."""
+    """Knowledge of each region of every seed, leading axes [seeds, R]."""
     return jax.vmap(partial(_table, config, goal, episode_length))(states)
 
 

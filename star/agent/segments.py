@@ -1,4 +1,4 @@
-"""What happened in one segment, the l env steps under one subgoal: what every level learns from."""
+"""The record of one segment, the l env steps under one subgoal: what every level learns from."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from jaxtyping import Array, Float
 from star.abstraction.regions import Box
 
 Policy = Callable[[Float[Array, "*batch state"], Float[Array, "*batch m"]], Float[Array, "*batch act"]]
-"""What the level below does in states under subgoals."""
+"""Actions of the level below in states under subgoals."""
 
 
 class Choice(struct.PyTreeNode):
-    """What a Tutor saw and did, and the subgoal that it stands for; without a Tutor the subgoal alone."""
+    """A Tutor's observation and action, and the subgoal that it stands for; without a Tutor the subgoal alone."""
 
     subgoal: Float[Array, "B m"]
     seen: Any = ()
@@ -32,7 +32,7 @@ class Segment(struct.PyTreeNode):
 
     obs: Float[Array, "l+1 B obs"]
     seen: Float[Array, "l+1 B seen"]
-    """What the Controller saw."""
+    """The Controller's observations."""
     subgoal: Float[Array, "l+1 B m"]
     action: Float[Array, "l B act"]
     terminated: Float[Array, "l B"]
@@ -47,7 +47,7 @@ class Segment(struct.PyTreeNode):
     choice: Choice
     """The Tutor's, [B]."""
     recorded: Any = None
-    """What the `Record` given to `play.segment` kept."""
+    """The parts that the `Record` given to `play.segment` kept."""
 
     @property
     def lost(self) -> Float[Array, "B"]:

@@ -1,4 +1,4 @@
-"""What greedy episodes need of a state: all else is 0, so that little is left of it in a compressed file."""
+"""The part of a state that greedy episodes need: all else is 0, so that little is left of it in a compressed file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a subgoal is: a point, where a Tutor sets it, or the target box itself, where there is none.
+"""Subgoals: points set by a Tutor, or the target box itself without one.
 
 Both are relative to the agent and move with it: h(s, g, s') = s + g - s', so that they stay where they are.
 
@@ -28,7 +28,7 @@ class Points(NamedTuple):
         return subgoal - (after - before)
 
     def distance(self, subgoal: Float[Array, "*batch p"]) -> Float[Array, "*batch"]:
-        """How far it is to the subgoal."""
+        """Distance to the subgoal."""
         return jnp.linalg.norm(subgoal, axis=-1)
 
     def ways(self, subgoal: Float[Array, "*batch p"]) -> Float[Array, "*batch p"]:
@@ -64,7 +64,7 @@ class Boxes(NamedTuple):
         return subgoal - jnp.tile(after - before, 2)
 
     def distance(self, subgoal: Float[Array, "*batch m"]) -> Float[Array, "*batch"]:
-        """How far it is to the nearest point of the box."""
+        """Distance to the nearest point of the box."""
         return jnp.linalg.norm(self.nearest(subgoal), axis=-1)
 
     def ways(self, subgoal: Float[Array, "*batch m"]) -> Float[Array, "*batch m"]:

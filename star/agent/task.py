@@ -1,4 +1,4 @@
-"""What all levels know of the task."""
+"""The knowledge of the task that all levels share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Task(NamedTuple):
 
     spec: Spec
     subgoals: Points | Boxes
-    """What the Controller is given: points by a Tutor, boxes where there is none."""
+    """The Controller's subgoals: points by a Tutor, boxes without one."""
     goal_margin: float | Array
     """Half-width of the box around a goal, all of which counts as reached."""
 
@@ -39,7 +39,7 @@ class Task(NamedTuple):
 
 
 def first_cuts(config: AgentConfig | Config, spec: Spec) -> list[list[float]]:
-    """Where the abstract space is cut at first: as the task says, or `abstraction.cuts`, or `abstraction.grid`."""
+    """First cuts of the abstract space: as the task says, or `abstraction.cuts`, or `abstraction.grid`."""
     if config.abstraction.grid is None:
         cuts = spec.region_cuts if config.abstraction.cuts is None else config.abstraction.cuts
         return [list(positions) for positions in cuts]

@@ -11,7 +11,7 @@
 The box around a goal that is close needs no subgoal on the way to it: with `straight` its centre is the subgoal, in
 training and in greedy episodes, and of these decisions nothing is learnt. So agents stay at goals.
 
-Where SGIM says so, a teacher sets the subgoal, straight ahead to his waypoint, which the Tutor imitates; or it is
+If SGIM says so, a teacher sets the subgoal, straight ahead to his waypoint, which the Tutor imitates; or it is
 random, of which the Tutor learns nothing.
 
 Source: STAR (ICLR 2024), section 4.1; off-policy correction: HIRO (Nachum et al. 2018), section 3.3.
@@ -40,7 +40,7 @@ CLOSE = 0.5  # of the farthest subgoal in each dimension: the Controller gets th
 
 
 class Trace(struct.PyTreeNode):
-    """What the Controller saw and did during one decision of the Tutor, for its off-policy correction."""
+    """The Controller's observations and actions during one decision of the Tutor, for its off-policy correction."""
 
     states: Float[Array, "*batch l state"]
     actions: Float[Array, "*batch l act"]
@@ -108,7 +108,7 @@ def act(
 
 
 def stands_close(task: Task, obs: Float[Array, "*batch obs"], box: Box) -> Bool[Array, "*batch"]:
-    """Where `box` is no larger than one around a goal, and wholly within half the reach of a subgoal."""
+    """True where `box` is no larger than one around a goal, and wholly within half the reach of a subgoal."""
     half = (box.upper - box.lower) / 2
     small = (half <= 1.01 * task.goal_margin) | ~task.spec.in_goal()  # its corners were rounded
     farthest = jnp.abs(box.centre - task.spec.abstract(obs)) + half
@@ -128,7 +128,7 @@ def subgoal(action: Float[Array, "*batch p"], scale: Float[Array, "p"]) -> Float
 def experience(
     section: TutorConfig, task: Task, segment: Segment, marks: Marks, *, renewed: Bool[Array, "B"]
 ) -> Transition:
-    """What a segment teaches, [B]; where it is `renewed`, the target box does not outlast the segment."""
+    """The transition of a segment, [B]; where it is `renewed`, the target box does not outlast the segment."""
     spec = task.spec
     achieved = spec.pose(segment.obs)
     distances = jnp.linalg.norm(spec.abstract(segment.obs) - segment.box.centre, axis=-1)

@@ -101,6 +101,6 @@ def towards_goals(batch: Decision) -> Float[Array, "N"]:
 
 
 def _targets(allowed: Bool[Array, "R R"], region: Int[Array, "n"], goal_region: Int[Array, "*n"]) -> Bool[Array, "n R"]:
-    """What may follow each `region`, if the goal is in `goal_region`."""
+    """Mask of the regions that may follow each `region`, if the goal is in `goal_region`."""
     home = jax.nn.one_hot(region, allowed.shape[0], dtype=bool)
     return allowed[region] | (home & (region == goal_region)[:, None])

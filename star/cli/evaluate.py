@@ -53,7 +53,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def add_goals(command: argparse.ArgumentParser) -> None:
-    """Which goals: `render` shows episodes of such evaluations."""
+    """The goals: `render` shows episodes of such evaluations."""
     command.add_argument(
         "--goals",
         choices=("test", "train", "grid"),

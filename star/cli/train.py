@@ -127,7 +127,7 @@ def _say_how_it_ended(result: Result, config: RunConfig) -> None:
 
 
 def _after_a_fault(result: Result, config: RunConfig) -> str:
-    """What is left of a run whose numbers were not finite, and how to go on."""
+    """The remains of a run whose numbers were not finite, and the way on."""
     flags = ["--trainer.on_non_finite", "rollback"]
     if config.trainer.on_non_finite == "rollback":
         flags += ["--trainer.rollbacks", str(2 * config.trainer.rollbacks)]

@@ -1,1 +1,1 @@
-"""What all settings are made of, and those of a run."""
+"""The parts of all settings, and the settings of a run."""

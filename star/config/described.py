@@ -1,4 +1,4 @@
-"""What a person is told of a setting: type, range or choices, unit, default and one sentence.
+"""The description of a setting: type, range or choices, unit, default and one sentence.
 
 All of it is read from the field itself, so that the range which is shown is the one that is checked.
 """

@@ -28,20 +28,20 @@ OURS: Mapping[str, str] = {
 """The experiments of this package, imported when they are first needed."""
 
 About = dict[str, Any]
-"""What a checkpoint says of itself: `format`, `config` (nested, as in `config.yaml`), the first measure, and more."""
+"""A checkpoint's words about itself: `format`, `config` (nested, as in `config.yaml`), the first measure, and more."""
 Arrays = dict[str, np.ndarray]
 """A state by the names of its leaves, such as `tutor/params/actor/...`; the leading axis is that of seeds."""
 
 
 class Measure(NamedTuple):
-    """What evaluations measure: in rows it is called `eval/<name>`."""
+    """A measure of evaluations: in rows it is called `eval/<name>`."""
 
     name: str
     better: Literal["high", "low"] = "high"
     label: str = ""
-    """What people read, such as `success at the last step`; the name if it is empty."""
+    """The name for people, such as `success at the last step`; the name if it is empty."""
     where: str = ""
-    """Where it is measured, in words, such as `on test goals`."""
+    """The place of measurement, in words, such as `on test goals`."""
     episodes: Callable[[Any], int] | None = None
     """Of a share in [0, 1]: how many episodes of each seed it is a share of, from the config."""
 
@@ -66,7 +66,7 @@ class Migration:
 
 
 class Notices(NamedTuple):
-    """What a person should know of a run while it goes on, and when it is over."""
+    """Notices of a run for a person, while it goes on and when it is over."""
 
     keys: tuple[str, ...] = ()
     """The metrics that it is drawn from."""
@@ -82,23 +82,23 @@ class Kind(NamedTuple):
     build: Callable[[Any], Any]
     """Makes the `Experiment` of a config; raises `UserError` if it cannot be made on this machine."""
     measures: tuple[Measure, ...]
-    """What its evaluations measure; checkpoints and sweeps rank by the first."""
+    """The measures of its evaluations; checkpoints and sweeps rank by the first."""
     title: Callable[[Any], str] = lambda config: config.experiment
-    """What a person calls the experiment of a config."""
+    """The experiment's name for people."""
     agent: Callable[[Any], str] = lambda config: ""
-    """What a person calls who learns in it, in a list of runs."""
+    """The learner's name for people, in a list of runs."""
     unit: str = "iterations"
-    """What `env_steps` counts, in words."""
+    """The unit that `env_steps` counts, in words."""
     in_step: bool = False
-    """Whether all seeds share a counter: a sweep then begins no trial among others that have begun."""
+    """True if all seeds share a counter: a sweep then begins no trial among others that have begun."""
     tables: str = "tables"
-    """What is written at each evaluation besides metrics, to `<tables>.jsonl`."""
+    """Name of the tables written at each evaluation besides metrics, to `<tables>.jsonl`."""
     row: Mapping[str, type] = {}
     """The keys of such a row, and what their values are."""
     may_be_nan: tuple[str, ...] = ()
     """Names of parts of the state that may be NaN or infinite, and of metrics that count what is no fault."""
     notices: Notices = Notices()
-    """What is said once of each seed and subject, and shown in the report."""
+    """Notices given once for each seed and subject, and shown in the report."""
     levels: Mapping[str, tuple[str | None, str | None, str | None]] = {}
     """Rows of the console: the metrics of reward, actor loss and critic loss of each level."""
     format: int = 1
@@ -118,7 +118,7 @@ class Kind(NamedTuple):
     its tables; and, for programs, `measure`, the rows of `star.evaluate`, and `load`, the agent of `star.load`."""
 
     def readable(self, number: Any) -> bool:
-        """Whether checkpoints of the format `number` can be read."""
+        """True if checkpoints of the format `number` can be read."""
         return number == self.format or number in self.migrations
 
     def migrated(self, about: About) -> About:
@@ -162,7 +162,7 @@ def lazily(name: str) -> Callable[..., Any]:
 
 
 def places() -> dict[str, list[str]]:
-    """What can be learnt in the experiments of this package: the tasks or worlds of each, by its name."""
+    """The subjects of this package's experiments: the tasks or worlds of each, by its name."""
     return {name: commands["envs"]() for name in OURS if "envs" in (commands := find(name).commands)}
 
 

@@ -109,7 +109,7 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
 
 
 def read_file(path: Path) -> dict[str, Any]:
-    """What a YAML file with sections holds; raises `UserError`."""
+    """The values of a YAML file with sections; raises `UserError`."""
     try:
         values = reading.plain(reading.text(path))
     except FileNotFoundError:
@@ -167,7 +167,7 @@ def first_of(error: ValidationError) -> ErrorDetails:
 
 
 def _fits(values: Mapping[str, Any], model: type[BaseModel]) -> bool:
-    """Whether these values go together by themselves."""
+    """True if these values go together by themselves."""
     try:
         model.model_validate(plain(values))
     except ValidationError:
@@ -176,7 +176,7 @@ def _fits(values: Mapping[str, Any], model: type[BaseModel]) -> bool:
 
 
 def _is_among(overrides: Mapping[str, Any], place: Sequence[str | int]) -> bool:
-    """Whether what is wrong at this `place` is one of the `overrides`, or a section or a part of one."""
+    """True if what is wrong at this `place` is one of the `overrides`, or a section or a part of one."""
     return any(all(a == str(b) for a, b in zip(key.split("."), place, strict=False)) for key in overrides if place)
 
 
@@ -220,7 +220,7 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def changed(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
-    """What `after` has, by its dotted keys, and `before` has not or not so."""
+    """The settings that `after` has, by its dotted keys, and `before` has not or not so."""
     return {key: value for key, value in after.items() if key not in before or before[key] != value}
 
 
@@ -294,7 +294,7 @@ def _nearest_key(path: Sequence[str], model: type[BaseModel]) -> str:
 
 
 def _has(model: Any, path: Sequence[str]) -> bool:
-    """Whether `path` leads to a setting or a section of `model`."""
+    """True if `path` leads to a setting or a section of `model`."""
     for part in path:
         if part not in getattr(model, "model_fields", {}):
             return False

@@ -14,7 +14,7 @@ from star.config.section import Positive, Section, setting
 
 
 def _is_simple(value: Any) -> bool:
-    """Whether `value` is what JSON has too, but for mappings: YAML knows dates and bytes as well."""
+    """True if `value` is what JSON has too, but for mappings: YAML knows dates and bytes as well."""
     if isinstance(value, list | tuple):
         return all(map(_is_simple, value))
     return isinstance(value, str | int | float | NoneType)
@@ -74,7 +74,7 @@ class TrainerConfig(Section):
     )
     on_non_finite: Literal["stop", "rollback"] = setting(
         "stop",
-        "Where a number is NaN or infinite, the run stops, or goes on from the last checkpoint with smaller steps.",
+        "If a number is NaN or infinite, the run stops, or goes on from the last checkpoint with smaller steps.",
     )
     rollback_factor: float = setting(
         0.5, "Each rollback multiplies all learning rates of the seed by this.", unit="", gt=0, lt=1
@@ -97,7 +97,7 @@ EXPERIMENTS = "star, saht, tutoring, or module:name of your own"
 
 
 class RunConfig(Section):
-    """What every experiment's settings have; it adds its own sections."""
+    """The settings of every experiment; each adds its own sections."""
 
     experiment: str = setting("star", "This is what learns.", allowed=EXPERIMENTS)
     trainer: TrainerConfig = TrainerConfig()
@@ -110,7 +110,7 @@ class RunConfig(Section):
         cls.model_rebuild(force=True)
 
     def hyper(self) -> Section:
-        """What the jitted functions see: all but the settings of the run. Its floats are traced."""
+        """The settings for the jitted functions: all but the settings of the run. Its floats are traced."""
         kind = _hyper(type(self))
         return kind.model_construct(**{name: getattr(self, name) for name in kind.model_fields})
 

@@ -1,4 +1,4 @@
-"""What settings are made of: frozen, validated groups that are pytrees."""
+"""The parts of settings: frozen, validated groups that are pytrees."""
 
 from __future__ import annotations
 

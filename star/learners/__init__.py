@@ -1,4 +1,4 @@
-"""How a level learns from what it did: PPO, TD3, or a learner of a user's own.
+"""Learning of a level from its own transitions: PPO, TD3, or a learner of a user's own.
 
     name                     `learner` in the settings of a level
     ppo, td3                 files in this folder, imported when they are first needed

@@ -50,7 +50,7 @@ class Returns(struct.PyTreeNode):
         return jnp.maximum(jnp.sqrt(self.variance), _LEAST)
 
     def normalized(self, returned: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """What the critic says of these returns."""
+        """The critic's values of these returns."""
         return (returned - self.mean) / self.deviation
 
     def restored(self, said: Float[Array, "*n"]) -> Float[Array, "*n"]:

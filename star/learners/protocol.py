@@ -1,4 +1,4 @@
-"""What a learner is: settings, and a few pure functions. Light: importing it imports no learner."""
+"""The protocol of a learner: settings, and a few pure functions. Light: importing it imports no learner."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class LearnerConfig(Section):
     """Settings of a learner, and what must be known of it before it is imported."""
 
     replays: ClassVar[bool] = False
-    """Whether old transitions are learnt from again; `update` then takes `relabel`."""
+    """True if old transitions are learnt from again; `update` then takes `relabel`."""
 
     def check(self, rollout: Rollout) -> None:
         """Raise ValueError in one line, beginning with the setting, if such rollouts cannot be learnt from."""

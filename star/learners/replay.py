@@ -1,4 +1,4 @@
-"""What a level experiences, and the rings that keep it.
+"""Transitions of a level, and the rings that keep them.
 
 The rings are flashbax item buffers; the functions here add masked batches to them.
 """
@@ -42,7 +42,7 @@ class Imitation(struct.PyTreeNode):
     weight: Float[Array, "M"]
 
     def loss(self, mean: Float[Array, "M act"]) -> Float[Array, ""]:
-        """What is added to the actor's loss; `mean` is what it would do on `obs`."""
+        """Term added to the actor's loss; `mean` is what it would do on `obs`."""
         return 0.5 * jnp.mean(self.weight * jnp.sum(jnp.square(mean - self.action), axis=-1))
 
 

@@ -56,7 +56,7 @@ class PPOConfig(LearnerConfig):
             )
 
     def scratch_bytes(self, rollout: Rollout) -> int:
-        """What networks keep of a minibatch to learn from it."""
+        """Memory of networks for a minibatch."""
         return rollout.size // self.minibatches * sum(self.hidden) * NUMBER
 
 
@@ -116,7 +116,7 @@ class TD3Config(BufferedConfig, LearnerConfig):
             )
 
     def scratch_bytes(self, rollout: Rollout) -> int:
-        """What networks keep of a batch to learn from it."""
+        """Memory of networks for a batch."""
         return self.batch_size * sum(self.hidden) * NUMBER
 
     def samples_per_transition(self, rollout: Rollout) -> float:
@@ -125,7 +125,7 @@ class TD3Config(BufferedConfig, LearnerConfig):
 
 
 class LevelConfig(Section):
-    """What Tutor and Controller have in common: a learner and a reward."""
+    """The common settings of Tutor and Controller: a learner and a reward."""
 
     learner: str = setting(
         "ppo", "The level learns by this algorithm.", allowed=f"{', '.join(BUILT_IN)} or module:name of your own"

@@ -1,9 +1,9 @@
-"""What runs left on disk, as values: rows of metrics and of tables, and with what settings they were trained.
+"""Runs read from disk: rows of metrics and of tables, and their settings.
 
     read      one run, which may still be going on
     together  runs that differ in their seeds alone, as one
 
-What no run writes is refused in one line.
+Content that no run writes is refused in one line.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class NothingYet(ConfigError):
 
 @dataclass(frozen=True)
 class Run:
-    """What a run, or several `together`, left on disk.
+    """The content of a run, or of several `together`.
 
     `epochs` are the complete ones: a row for each seed, in the order of the seeds. `stretches` and `again`, the
     commands that train the same, have an entry for each of the `paths`.
@@ -130,7 +130,7 @@ def together(name: str, runs: Sequence[Run]) -> Run:
 
 
 def _stretches(starts: Sequence[Row], config: RunConfig, *, source: str) -> list[Stretch]:
-    """What is left of each start of a run with this `config.yaml`.
+    """Provenance of each start of a run with this `config.yaml`.
 
     That is nothing if a later one went on from before it, or if all env steps were done already.
     """

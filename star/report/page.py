@@ -88,13 +88,13 @@ def _shown(run: Run, *, most: int) -> dict[str, Any]:
 
 
 def _map(run: Run, most: int) -> dict[str, Any] | None:
-    """What its kind of experiment draws of its tables, if it does."""
+    """The drawing of its tables, if its kind of experiment has one."""
     draw = kinds.of(run.config).commands.get("map")
     return draw(run.config, run.tables, run.seeds, most=most) if draw and run.tables else None
 
 
 def facts(run: Run) -> dict[str, Any]:
-    """How far the run is, how well it does, what it was made with, and how to make it again.
+    """Progress and success of the run, its provenance, and the command to make it again.
 
     `measured` has [mean, low, high] over seeds of each measure in the last evaluation, or None before the first.
     """
@@ -122,7 +122,7 @@ def facts(run: Run) -> dict[str, Any]:
 
 
 def notices(run: Run) -> list[str]:
-    """What a person should know of each seed."""
+    """Notices about each seed."""
     lines = kinds.of(run.config).notices.lines
     found = {seed: lines([row for rows in run.epochs for row in rows if row["seed"] == seed]) for seed in run.seeds}
     return [f"seed {seed}: {line}" for seed, of_seed in found.items() for line in of_seed.values()]
@@ -136,7 +136,7 @@ def _episodes(measure: Measure, config: RunConfig) -> int | None:
 def evaluation_curves(
     epochs: Sequence[Sequence[Row]], measures: Sequence[Measure], config: RunConfig
 ) -> dict[str, Any]:
-    """What evaluations found, as curves over `env_steps` and `wall_s`, thinned to `MAX_POINTS`.
+    """Results of evaluations, as curves over `env_steps` and `wall_s`, thinned to `MAX_POINTS`.
 
     Each has the `mean` over seeds, `low` and `high` (95 % interval of that mean, None of one seed), and the `seeds`
     themselves.

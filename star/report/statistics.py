@@ -104,7 +104,7 @@ def _proportion(successes: int, trials: int, method: Literal["wilson", "exact"])
 
 
 def above(scores: Sequence[float] | np.ndarray) -> dict[str, Any]:
-    """How many `seeds` score above `ABOVE`, of how many (`of`), with the `interval` of that share (Clopper-Pearson)."""
+    """Number of `seeds` that score above `ABOVE`, of all (`of`), and the `interval` of that share (Clopper-Pearson)."""
     count = int((np.asarray(scores) > ABOVE).sum())
     return {"seeds": count, "of": len(scores), "interval": exact_interval(count, len(scores))}
 
@@ -168,7 +168,7 @@ def profile(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def improvement(better: Scores, than: Scores) -> float | None:
-    """How likely a run of one group scores higher than one of another on a task that both have; ties count half.
+    """Probability that a run of one group scores higher than one of another on a task that both have; ties count half.
 
     None if they have no task in common.
     """

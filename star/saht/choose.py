@@ -1,4 +1,4 @@
-"""What a learner practises next, and what it is told of the progress that it made: SGIM's selection, in two tables.
+"""The next exercise of a learner, and its record of the progress made: SGIM's selection, in two tables.
 
 `choice` has the tasks as regions, never split, and all strategies. It decides task and strategy. `goals` has regions of
 goals, each of one task, and no strategies. It decides the goal, and splits itself. In one table for both, few blocks
@@ -106,7 +106,7 @@ def competence(distance: Array) -> Array:
 
 
 class Progress(NamedTuple):
-    """What a block has added: distances of what is nearest in memory, scaled."""
+    """The additions of a block: distances of what is nearest in memory, scaled."""
 
     before: Float[Array, ""]
     """Of the goal, before the block."""
@@ -115,7 +115,7 @@ class Progress(NamedTuple):
     new: Float[Array, "K S"]
     """Of each outcome of the block, from what was known before it."""
     reached: Bool[Array, "K S"]
-    """Which tasks each iteration had an outcome in."""
+    """Mask of the tasks in which each iteration had an outcome."""
 
 
 def told(config: ChoiceConfig, tables: Tables, choice: Choice, seen: Progress) -> Tables:

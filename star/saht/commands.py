@@ -24,7 +24,7 @@ from star.saht.teachers import Demonstrations
 from star.training.checkpoint import load_agent
 
 _OF_EPISODES = {"envs": 1, "steps": None, "camera": None, "goals": "test", "grid": None}
-"""What `star render` takes for tasks of STAR alone, and what it is if nobody sets it."""
+"""Flags of `star render` for tasks of STAR alone, with their defaults."""
 
 
 def envs() -> list[str]:
@@ -77,7 +77,7 @@ def _showable(world: World) -> int:
 
 
 def _shown(world: World, task: int, goal: Any) -> tuple[Any, Any]:
-    """What the world's teacher shows for a goal, or a random sequence if there is none."""
+    """The teacher's demonstration of a goal, or a random sequence if there is none."""
     if world.tasks[task].demonstrate is not None:
         return world.demonstrate(task, goal)
     size = (world.longest, world.primitive)

@@ -1,4 +1,4 @@
-"""How good a learner is: for every goal of the evaluation, the distance to the nearest outcome in its memory.
+"""The competence of a learner: for every goal of the evaluation, the distance to the nearest outcome in its memory.
 
 Worlds always begin from rest, so without noise a sequence that is executed again has the same outcome: this is the
 error of acting by the nearest neighbour.

@@ -63,11 +63,11 @@ class Saht(Experiment):
             )
 
     def data(self) -> Shown:
-        """What the teachers show."""
+        """The teachers' demonstrations."""
         return teachers.shown_by(self.config.saht.teachers, self.world, self.scale)
 
     def setting(self, shown: Shown) -> Setting:
-        """What strategies need besides a memory."""
+        """The needs of strategies besides a memory."""
         return Setting(self.world, self.scale, self.ways, shown, self.config.saht.generation)
 
     @over_seeds
@@ -126,7 +126,7 @@ class Saht(Experiment):
 
     @over_seeds
     def _metrics(self, hyper: Learner, state: State, seen: Seen) -> dict[str, Array]:
-        """What is told of an epoch, whose blocks [B, ...] are `seen`."""
+        """The metrics of an epoch, whose blocks [B, ...] are `seen`."""
         task = jax.nn.one_hot(seen.choice.task, len(self.world.tasks))
         way = jax.nn.one_hot(seen.choice.strategy, len(self.ways))
         lengths = task.T @ seen.length / jnp.maximum(task.sum(axis=0), 1.0)
@@ -173,7 +173,7 @@ class Saht(Experiment):
         return figures.figures(self.world, self.ways, rows, tables)
 
     def facts(self, rows: Sequence[Mapping[str, Any]]) -> Mapping[str, str]:
-        """What is practised most, and how often teachers are asked."""
+        """The most practised task, and the share of teachers."""
         tasks = {name: mean(rows, f"saht/task_{name}") or 0.0 for name in self.world.names}
         found = {"practises": "  ".join(f"{name} {share:.2f}" for name, share in tasks.items())}
         taught = self.ways[len(self.config.saht.strategies) :]

@@ -1,4 +1,4 @@
-"""What a run of SGIM-SAHT shows of itself, as the figures of the thesis do: what was practised, how, and what for."""
+"""Figures of a run of SGIM-SAHT, as in the thesis: tasks practised, strategies, and purposes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ KINDS = {
     "outcome": ("teachers of outcomes", "#ccbb44"),
     "procedure": ("teachers of procedures", "#aa3377"),
 }
-"""What each kind of strategy is called, and its colour."""
+"""The name and colour of each kind of strategy."""
 TASKS = ("#4477aa", "#66ccee", "#228833", "#ccbb44", "#ee6677", "#aa3377", "0.5", "#994455", "#004488", "#ddaa33")
 _MOST_MATRICES = 12
 
@@ -76,7 +76,7 @@ def summary(world: World, rows: Sequence[Row]) -> Figure:
 
 
 def curriculum(world: World, ways: Sequence[Way], rows: Sequence[Row]) -> Figure:
-    """What was practised over time, and how: means over seeds."""
+    """Tasks practised over time, and strategies: means over seeds."""
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     moments = by_step(rows)
@@ -105,7 +105,7 @@ def curriculum(world: World, ways: Sequence[Way], rows: Sequence[Row]) -> Figure
 
 
 def strategies(world: World, ways: Sequence[Way], last: Sequence[Row]) -> Figure:
-    """How each task was practised: the iterations of a seed, by kind of strategy."""
+    """Strategies of each task: the iterations of a seed, by kind of strategy."""
     chosen = np.mean([row["chosen"] for row in last], axis=0)  # [S, M]
     kinds = _by_kind(ways, lambda way: chosen[:, list(ways).index(way)])
     figure = Figure(figsize=(7, 4), layout="constrained")

@@ -7,7 +7,7 @@ from star.saht.sections import Config
 
 
 def agent(config: Config) -> str:
-    """What an algorithm is called, by what it can do."""
+    """The name of an algorithm, by its abilities."""
     section = config.saht
     kinds = {teacher.kind for teacher in section.teachers}
     if section.ask_every is not None:

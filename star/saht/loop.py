@@ -49,7 +49,7 @@ class State(struct.PyTreeNode):
 
 
 class Seen(NamedTuple):
-    """What is told of a block."""
+    """The metrics of a block."""
 
     choice: Choice
     grown: Float[Array, ""]

@@ -1,9 +1,9 @@
 """Episodic memory: every sequence that was executed, with its outcomes, in arrays that never change their shape.
 
 Distances are Euclidean over *scaled* outcomes: each dimension over its extent, and all over the root of the number of
-dimensions, so 1 is the diagonal of an outcome space. What is nearest is found exactly. A loop over chunks of rows ends
-with the rows written so far: the work grows with what is remembered, in one compiled program. For the k best, groups of
-rows are compared first, then the members of the k best groups.
+dimensions, so 1 is the diagonal of an outcome space. The nearest rows are found exactly. A loop over chunks of rows
+ends with the rows written so far: the work grows with what is remembered, in one compiled program. For the k best,
+groups of rows are compared first, then the members of the k best groups.
 
 N is the capacity, S the number of tasks, L the longest sequence, p the numbers of a primitive. All functions are of one
 learner; vmap over learners that have written as many rows.
@@ -27,7 +27,7 @@ CHUNK, GROUP = 1024, 8  # rows
 FAR = 1e3
 """Distance of what was not reached: no two outcomes within their bounds are farther apart than 1."""
 GAMMA = 1.2
-"""What a primitive more makes of a rank."""
+"""The factor on a rank for one primitive more."""
 OFFSET = 0.01  # of a distance in ranks: an exact outcome of a long sequence still has a rank above 0
 
 
@@ -47,7 +47,7 @@ class Memory(struct.PyTreeNode):
 
 
 class Scale(NamedTuple):
-    """How outcomes are scaled: (value - `lower`) / `width`; 1 in dimensions that a task has not."""
+    """The scale of outcomes: (value - `lower`) / `width`; 1 in dimensions that a task has not."""
 
     lower: Float[np.ndarray, "S 4"]
     width: Float[np.ndarray, "S 4"]
@@ -114,7 +114,7 @@ def write(memory: Memory, row: Array, new: Memory) -> Memory:
 
 
 class Piece(NamedTuple):
-    """What a task has in some of the rows."""
+    """A task's part of some of the rows."""
 
     outcomes: Float[Array, "4 *n"]
     lengths: Int[Array, "*n"]
@@ -141,7 +141,7 @@ def squared(outcomes: Float[Array, "4 *n"], goal: Float[Array, "*m 4"]) -> Float
 
 
 def rank(square: Array, lengths: Array) -> Array:
-    """What is best is near and short: (distance + `OFFSET`) `GAMMA`^length, from squared distances."""
+    """The best is near and short: (distance + `OFFSET`) `GAMMA`^length, from squared distances."""
     return (jnp.sqrt(square) + OFFSET) * jnp.exp(np.log(GAMMA) * lengths)
 
 
@@ -162,7 +162,7 @@ def least(
 
 
 def distances(memory: Memory, rows: Array | int, found: Float[Array, "K S 4"]) -> Float[Array, "K S"]:
-    """How far the nearest of the first `rows` rows is from each of K outcomes in each task."""
+    """Distance of the nearest of the first `rows` rows from each of K outcomes in each task."""
 
     def nearer(best: Array, number: Array, task: int) -> Array:
         # part by part: on a CPU a minimum over an axis takes eight times as long
@@ -185,7 +185,7 @@ class Neighbours(NamedTuple):
 
     @property
     def known(self) -> Bool[Array, "k"]:
-        """Which of them exist."""
+        """Mask of those that exist."""
         return self.distances < FAR / 2
 
 

@@ -68,7 +68,7 @@ class TeacherConfig(Section):
 
 
 class ChoiceConfig(Section):
-    """How task, strategy and goal are chosen by progress over cost."""
+    """The choice of task, strategy and goal by progress over cost."""
 
     random: float = setting(0.1, "This share of choices is drawn evenly.", unit="", ge=0, le=1)
     tasks: float = setting(1.0, "Tasks are drawn in proportion to their best interest to this power.", unit="", gt=0)
@@ -82,7 +82,7 @@ class ChoiceConfig(Section):
         0.001, "The doubt about what a strategy adds begins with 1 and grows by this in a block.", unit="", gt=0
     )
     reached: float = setting(
-        0.1, "What is reached on the way tells this much of what the goal tells.", unit="", ge=0, le=1
+        0.1, "An outcome reached on the way tells this much of what the goal tells.", unit="", ge=0, le=1
     )
     regions: Annotated[int, Field(gt=0, le=1024)] = setting(
         32, "Goals are drawn in so many regions at most, each of one task.", unit="regions"
@@ -97,7 +97,7 @@ class ChoiceConfig(Section):
 
 
 class SahtConfig(Section):
-    """What a learner can do, and how it chooses."""
+    """A learner's abilities and choices."""
 
     strategies: tuple[Literal["random", "actions", "procedures"], ...] = setting(
         ("actions",), "These are the ways to practise alone: at random, by what is near the goal, or by two subgoals."
@@ -152,7 +152,7 @@ class SahtTrainer(TrainerConfig):
 
 
 class Learner(Section):
-    """What the jitted functions see."""
+    """The settings for the jitted functions."""
 
     saht: SahtConfig = SahtConfig()
 
@@ -175,5 +175,5 @@ class Config(RunConfig):
         return self
 
     def hyper(self) -> Learner:
-        """What the jitted functions see; they have the world of the experiment."""
+        """The settings for the jitted functions; they have the world of the experiment."""
         return Learner(saht=self.saht)

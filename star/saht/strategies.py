@@ -53,7 +53,7 @@ class Way(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What strategies need besides the memory."""
+    """The needs of strategies besides the memory."""
 
     world: World
     scale: Scale
@@ -63,18 +63,18 @@ class Setting(NamedTuple):
     """G."""
 
     def of_way(self, way: Array, name: str) -> Array:
-        """What is noted of a strategy, by its number."""
+        """The notes on a strategy, by its number."""
         return jnp.array([getattr(one, name) for one in self.ways])[way]
 
 
 class Order(NamedTuple):
-    """What is to be done: a scaled goal of a task, by the strategy number `way`."""
+    """The exercise: a scaled goal of a task, by the strategy number `way`."""
 
     task: Int[Array, ""]
     goal: Float[Array, "4"]
     way: Int[Array, ""]
     first: Bool[Array, ""]
-    """Whether a block begins with it: then the first sequence is as a teacher shows it."""
+    """True if a block begins with it: then the first sequence is as a teacher shows it."""
 
 
 class Proposals(struct.PyTreeNode):
@@ -116,7 +116,7 @@ class Dice(NamedTuple):
 
 
 def _parts(draw: Any, key: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    """What one call draws, in these shapes."""
+    """The draws of one call, in these shapes."""
     sizes = np.array([math.prod(shape) for shape in shapes])
     parts = jnp.split(draw(key, (int(sizes.sum()),)), np.cumsum(sizes)[:-1])
     return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
@@ -130,7 +130,7 @@ class Two(NamedTuple):
 
 
 def propose(setting: Setting, memory: Memory, rows: Array, order: Order, *, key: Array) -> Proposals:
-    """What the strategy makes. Each kind that there is is computed, so that learners side by side may differ."""
+    """The strategy's sequences. Each kind that there is is computed, so that learners side by side may differ."""
     dice = Dice.thrown(setting.world, setting.generation, key=key)
     kinds = {way.kind for way in setting.ways}
     made: dict[str, Proposals] = {}
@@ -265,7 +265,7 @@ def taught(setting: Setting, order: Order, dice: Dice) -> Two:
 
 
 def refine(setting: Setting, memory: Memory, rows: Array, two: Two, dice: Dice) -> Proposals:
-    """What reached the outcomes nearest to both goals, one after the other, if both fit; anything where nothing does.
+    """The sequences that reached the outcomes nearest to both goals, one after the other; anything if they do not fit.
 
     Nearest is by `rank`, and leaves room: for one more primitive, and for the first sequence.
     """

@@ -45,7 +45,7 @@ class Demonstrations(NamedTuple):
 
 
 class Shown(struct.PyTreeNode):
-    """What T teachers show, each up to D demonstrations; procedural ones show none."""
+    """The demonstrations of T teachers, up to D each; procedural ones show none."""
 
     sequences: Float[Array, "T D L p"]
     lengths: Int[Array, "T D"]
@@ -84,7 +84,7 @@ def expanded(teachers: Sequence[TeacherConfig], world: World) -> tuple[TeacherCo
 
 
 def shown_by(teachers: Sequence[TeacherConfig], world: World, scale: Scale) -> Shown:
-    """What they show, scaled; raises `UserError` in one line if a file is not what it should be."""
+    """Their demonstrations, scaled; raises `UserError` in one line if a file is wrong."""
     all_shown = [_demonstrations(teacher, world, scale) for teacher in teachers]
     most = max((len(demos.lengths) for demos in all_shown), default=1)
 
@@ -121,7 +121,7 @@ def _nothing(world: World) -> Demonstrations:
 
 
 def demonstrated(world: World, task: int, count: int, scale: Scale) -> Demonstrations:
-    """What the world's own teacher shows: goals drawn evenly, of which those count that he reaches, without noise.
+    """Demonstrations of the world's own teacher without noise: goals drawn evenly, of which reached ones count.
 
     Raises:
       UserError: in one line, if he reaches too few.
@@ -203,5 +203,5 @@ def _check(arrays: dict[str, np.ndarray], world: World) -> None:
 
 
 def _can(task: Task, kind: str) -> bool:
-    """Whether the world itself can show a task so."""
+    """True if the world itself can show a task so."""
     return (task.decompose if kind == "procedure" else task.demonstrate) is not None

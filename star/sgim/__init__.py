@@ -7,7 +7,7 @@
 
 Source: S. M. Nguyen, habilitation thesis; SGIM-ACTS (Nguyen and Oudeyer 2012), SGIM-PB (Duminy, Nguyen, Duhaut 2021).
 
-What needs JAX is imported when it is first used.
+Modules that need JAX are imported at their first use.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class Bed(NamedTuple):
 
 
 class Course(struct.PyTreeNode):
-    """What happened, block by block."""
+    """The history, block by block."""
 
     region: Int[Array, "blocks"]
     strategy: Int[Array, "blocks"]

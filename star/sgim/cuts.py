@@ -1,4 +1,4 @@
-"""How SGIM follows cuts of its regions, and where it makes one itself if nobody else does.
+"""SGIM follows cuts of its regions, and makes one itself if nobody else does.
 
 Source of its own cuts: SAGG-RIAC (Baranes and Oudeyer 2013).
 """

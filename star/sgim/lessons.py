@@ -36,30 +36,30 @@ Metrics = dict[str, Array]
 
 
 class Way(struct.PyTreeNode):
-    """Where a lesson leads B environments."""
+    """Lessons of B environments."""
 
     target: Int[Array, "B"]
     """The region to command; -1 where that is the Commander's business."""
     aside: Bool[Array, "B"]
-    """Whether the Tutor is given the box around `point`, not the region."""
+    """True if the Tutor is given the box around `point`, not the region."""
     point: Float[Array, "B d"]
     """The next waypoint."""
     led: Bool[Array, "B"] | None
-    """Whether a teacher sets the subgoal, straight to `point`; None if none ever does."""
+    """True if a teacher sets the subgoal, straight to `point`; None if none ever does."""
 
 
 class Marks(struct.PyTreeNode):
-    """What SGIM says of one decision of each environment; None where it never says anything."""
+    """SGIM's part in one decision of each environment; None where it never says anything."""
 
     own: Bool[Array, "B"] | None = None
-    """Whether subgoals are the Tutor's own or his teacher's, not random."""
+    """True if subgoals are the Tutor's own or his teacher's, not random."""
     shown: Bool[Array, "B"] | None = None
-    """Whether a teacher chooses the target."""
+    """True if a teacher chooses the target."""
     way: Way | None = None
 
     @property
     def led(self) -> Bool[Array, "B"] | None:
-        """Where a teacher sets the subgoal."""
+        """True where a teacher sets the subgoal."""
         return None if self.way is None else self.way.led
 
 
@@ -148,7 +148,7 @@ def restart(
 def end(
     config: SgimConfig, spec: Spec, state: SgimState, lesson: Lesson, *, distance: Float[Array, "B"]
 ) -> tuple[SgimState, Metrics]:
-    """What SGIM learns from an epoch whose last episodes ended `distance` m from their goals."""
+    """SGIM's learning from an epoch whose last episodes ended `distance` m from their goals."""
     over = jnp.ones_like(lesson.taught)
     return learn(config, state, devices.whole(grade(lesson, over, distance, radius=spec.success_radius)))
 
@@ -206,7 +206,7 @@ def onward(
     *,
     parts: int = 16,
 ) -> tuple[Float[Array, "B d"], Bool[Array, "B"]]:
-    """Where the way from `position` by the waypoints to come first leaves the box, and whether it does.
+    """The point where the way from `position` by the next waypoints first leaves the box, and True if it does.
 
     It is looked for at `parts` points on each straight leg.
     """
@@ -218,14 +218,14 @@ def onward(
 
 
 def babbles(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
-    """Which environments are to follow random subgoals."""
+    """Mask of environments that follow random subgoals."""
     if "babbling" not in config.strategies:
         return jnp.zeros(lesson.taught.shape, bool)
     return lesson.taught & (lesson.choice.strategy == config.strategies.index("babbling"))
 
 
 def guided(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
-    """Where a teacher chooses the Commander's targets now."""
+    """True where a teacher chooses the Commander's targets now."""
     return (lesson.leg < lesson.waypoints.shape[1]) & (lesson.choice.strategy >= len(config.strategies))
 
 
@@ -261,14 +261,14 @@ def learn(config: SgimConfig, state: SgimState, lesson: Lesson) -> tuple[SgimSta
 
 
 def attraction(config: SgimConfig, state: SgimState) -> Float[Array, "R"] | None:
-    """How the Commander's random targets are drawn: as regions to practise are; None if evenly."""
+    """Weights of the Commander's random targets: as regions to practise are; None if evenly."""
     if not config.exploration:
         return None
     return selection.probabilities(config.selection, state).sum(axis=-1)
 
 
 def urgency(config: SgimConfig, state: SgimState) -> Float[Array, "R"] | float:
-    """How much there is to find out by examining edges that lead to each region, from 0 to 1.
+    """Interest in examining edges that lead to each region, from 0 to 1.
 
     Most where it is reached half of the time and no progress is made; a tenth of that where nothing is to be expected.
     """

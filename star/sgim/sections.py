@@ -104,9 +104,9 @@ class SgimConfig(Section):
     )
     unaided: bool = setting(True, "With ask progress, who would ask goes alone as often as the region is mastered.")
     exploration: bool = setting(False, "The Commander's random targets are drawn by progress.")
-    refinement: bool = setting(False, "What is half mastered and makes no progress is examined first.")
+    refinement: bool = setting(False, "Edges half mastered and without progress are examined first.")
     waypoint_radius: float = setting(2.0, "A waypoint counts as passed within this distance.", unit="m", gt=0)
-    detours: bool = setting(True, "What a teacher only goes around to is not believed to be reached directly.")
+    detours: bool = setting(True, "Regions a teacher only reaches around others are not believed reached directly.")
     subgoals: bool = setting(
         True, "On the way to a teacher's waypoint the Tutor is shown subgoals straight ahead, to imitate."
     )
@@ -131,12 +131,12 @@ class SgimConfig(Section):
 
     @property
     def shows_subgoals(self) -> bool:
-        """Whether there is a teacher who sets the Tutor's subgoals."""
+        """True if there is a teacher who sets the Tutor's subgoals."""
         return self.subgoals and bool(self.routes)
 
     @property
     def enabled(self) -> bool:
-        """Whether anything is left to intrinsic motivation."""
+        """True if anything is left to intrinsic motivation."""
         return self.goals or self.exploration or self.refinement or self.names != ("autonomous",)
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Which region of goals to practise, with which strategy: where competence grows most for what it costs.
+"""The choice of a region of goals to practise, and of a strategy: where competence grows most for what it costs.
 
     progress by strategy s      P_rs = what a block of episodes with s adds to the competence of region r
     doubt                       v_rs = how uncertain that is
@@ -41,7 +41,7 @@ RANDOM, INTEREST, BEST = 0, 1, 2  # modes of a choice
 
 
 class SgimState(struct.PyTreeNode):
-    """What is remembered of every region, and of every strategy in it."""
+    """The memory of every region, and of every strategy in it."""
 
     abstraction: Abstraction
     costs: Float[Array, "S"]
@@ -66,7 +66,7 @@ class SgimState(struct.PyTreeNode):
 
 
 class Choice(struct.PyTreeNode):
-    """What to practise: a goal in a region, and the strategy to practise it with."""
+    """The exercise: a goal in a region, and the strategy to practise it with."""
 
     region: Int[Array, "*batch"]
     strategy: Int[Array, "*batch"]
@@ -108,7 +108,7 @@ def init(config: SelectionConfig, abstraction: Abstraction, costs: Sequence[floa
 
 
 def progress(state: SgimState) -> Float[Array, "R"]:
-    """How much the competence of each region has grown over its window, in units of competence; 0 if inactive."""
+    """Growth of the competence of each region over its window, in units of competence; 0 if inactive."""
     newer, older = _halves(state)
     grown = mean_where(state.competences, newer) - mean_where(state.competences, older)
     return jnp.where(state.abstraction.active & newer.any(axis=-1), grown, 0.0)
@@ -129,7 +129,7 @@ def mastered(state: SgimState) -> Float[Array, "R d"]:
 
 
 def interest(config: SelectionConfig, state: SgimState) -> Float[Array, "R S"]:
-    """What each strategy adds to the competence of each region, if all goes well, over its cost; 0 if inactive.
+    """Gain of each strategy: what it adds to the competence of each region at best, over its cost; 0 if inactive.
 
     Loss of competence is worth nothing, or with `forgetting` that share of a gain. What is unknown is worth no more
     than the best that is known, so that slow learning is not drowned by curiosity.
@@ -347,7 +347,7 @@ def credit(
 
 
 def _known(state: SgimState) -> Bool[Array, "R W"]:
-    """Which slots of each region's window have been written."""
+    """Mask of the slots of each region's window that have been written."""
     return jnp.arange(state.competences.shape[1]) < state.written[:, None]
 
 

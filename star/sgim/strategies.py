@@ -1,4 +1,4 @@
-"""What SGIM decides about an epoch of B environments: whose goals, whose way, whose help.
+"""SGIM's decisions about an epoch of B environments: whose goals, whose way, whose help.
 
     alone    autonomous      the three levels as ever
              babbling        random subgoals instead of the Tutor's
@@ -30,12 +30,12 @@ from star.sgim.teachers import Demonstrations, nearest
 
 
 class Lesson(struct.PyTreeNode):
-    """What each environment practises in an epoch, and how it went."""
+    """The exercise of each environment in an epoch, and its outcome."""
 
     choice: Choice
     """Region, strategy and goal; the goal [B, d] is an abstract point."""
     taught: Bool[Array, "B"]
-    """Where SGIM has a say: not in environments that practise reaching random regions."""
+    """True where SGIM has a say: not in environments that practise reaching random regions."""
     waypoints: Float[Array, "B L d"]
     first: Int[Array, "B"]
     """The waypoint that an episode begins with; L where the Commander decides alone."""
@@ -86,7 +86,7 @@ def assign(
 
 
 def available(config: SgimConfig, state: SgimState, *, key: Array) -> Bool[Array, "S"]:
-    """Which strategies there are in this epoch: all alone, and the teachers who are there and not exhausted."""
+    """Mask of the strategies of this epoch: all alone, and the teachers who are there and not exhausted."""
     alone, asked = len(config.strategies), state.episodes.sum(axis=0)
     share = jnp.asarray([1.0] * alone + [teacher.availability for teacher in config.teachers])
     return (jax.random.uniform(key, share.shape) < share) & (asked < _budgets(config))
@@ -95,7 +95,7 @@ def available(config: SgimConfig, state: SgimState, *, key: Array) -> Bool[Array
 def by_what_is_mastered(
     state: SgimState, *, start: Float[Array, "B d"], goal: Float[Array, "B d"], key: Array
 ) -> Float[Array, "B d"]:
-    """What is mastered best in a region, drawn evenly."""
+    """The point mastered best in a region, drawn evenly."""
     via = jax.random.randint(key, goal.shape[:1], 0, state.abstraction.count)
     return selection.mastered(state)[via]
 
@@ -114,7 +114,7 @@ def _prepare(
     taught: Bool[Array, "B"],
     key: Array,
 ) -> Lesson:
-    """What the chosen strategies make of goals and ways."""
+    """Goals and ways by the chosen strategies."""
     length = max([1, *(demos.waypoints.shape[1] for demos in teachers)])
     goal = choice.goal
     waypoints, guided = jnp.repeat(goal[:, None], length, axis=1), jnp.zeros(len(goal), bool)
@@ -145,7 +145,7 @@ def _prepare(
 
 
 def _within_budget(config: SgimConfig, state: SgimState, choice: Choice, taught: Bool[Array, "B"]) -> Choice:
-    """Where a teacher was asked more often than is allowed, the first strategy instead."""
+    """The choices, with the first strategy wherever a teacher was asked more often than allowed."""
     asked = jax.nn.one_hot(choice.strategy, len(config.names)) * taught[:, None]
     number = state.episodes.sum(axis=0) + jnp.cumsum(asked, axis=0)
     mine = choice.strategy[:, None]

@@ -255,7 +255,7 @@ class Cmaes(CmaEsSampler):
         self._completed = completed_trials
 
     def _init_optimizer(self, trans: Any, direction: StudyDirection) -> Any:
-        """The optimiser, told of all whole generations. What Optuna would tell it next is then one too few."""
+        """The optimiser, told of all whole generations. Optuna's next number for it is then one too few."""
         optimizer = super()._init_optimizer(trans, direction)
         sign = 1 if direction == StudyDirection.MINIMIZE else -1
         size = optimizer.population_size

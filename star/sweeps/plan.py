@@ -1,4 +1,4 @@
-"""What a sweep file says, checked: settings that are searched, by whom, and for what."""
+"""A checked sweep file: the settings searched, the sampler and the measure."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Parameter(_Model):
 
     @property
     def ends(self) -> tuple[Any, ...]:
-        """What must be allowed for everything else to be: all choices, or both ends of the range."""
+        """The values whose validity implies that of all others: all choices, or both ends of the range."""
         return (self.low, self.high) if self.choices is None else self.choices
 
 
@@ -124,17 +124,17 @@ class Plan:
 
     @property
     def measure(self) -> Measure:
-        """What decides which trial is best."""
+        """The measure that ranks trials."""
         return next(one for one in self.kind.measures if self.file.objective in (None, one.name))
 
     @property
     def objective(self) -> str:
-        """What decides, in words."""
+        """The same, in words."""
         return self.measure.name + (", mean of all evaluations" if self.file.summary == "mean" else "")
 
     @property
     def description(self) -> dict[str, Any]:
-        """What must be equal for workers to share a study. How many trials, and on what machine, may differ."""
+        """The part that workers of one study must have in common. Number of trials and machine may differ."""
         values = self.base.model_dump(mode="json", exclude={"env": {"engine"}, "trainer": {"device", "devices"}})
         about = self.file.model_dump(mode="json", include={"parameters", "sampler", "pruner", "prune_after", "summary"})
         return about | {"objective": self.measure.name, "settings": values}
@@ -148,7 +148,7 @@ class Plan:
 
     @property
     def trials(self) -> int:
-        """How many there are to be."""
+        """Their wanted number."""
         return self.file.trials if self.grid is None else min(self.file.trials, len(self.grid))
 
     def config(self, parameters: Mapping[str, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""What a sweep leaves for people: a table of its trials, `trials.csv` and figures."""
+"""The output of a sweep for people: a table of its trials, `trials.csv` and figures."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ _WAIT_S = 2.0  # between looks at what other workers do
 
 
 class Bench(Protocol):
-    """What trains a batch of trials: `star.training.side_by_side.SideBySide`."""
+    """The trainer of a batch of trials: `star.training.side_by_side.SideBySide`."""
 
     slots: int
     epochs: int
@@ -147,7 +147,7 @@ def work(
 
 @dataclass(frozen=True)
 class Summary:
-    """How a sweep stands: a row for each trial, whether all have ended, and the row of the best."""
+    """State of a sweep: a row for each trial, whether all have ended, and the row of the best."""
 
     rows: list[dict[str, Any]]
     finished: bool
@@ -190,7 +190,7 @@ class _Worker:
                 self._end(trial, None, reason=str(error))
 
     def others_at_work(self) -> bool:
-        """Whether the study has trials that have not ended."""
+        """True if the study has trials that have not ended."""
         states = [trial.state for trial in self.ledger.trials()]
         self.display.update(ended=sum(state.is_finished() for state in states), status="waiting for other workers")
         return not all(state.is_finished() for state in states)
@@ -273,7 +273,7 @@ class _Worker:
         return True
 
     def _value(self, one: _Run) -> float:
-        """What the trial is worth so far; raises IndexError before its first evaluation."""
+        """The trial's score so far; raises IndexError before its first evaluation."""
         values = one.evaluations[self.found.measure.name]
         return values[-1] if self.found.file.summary == "end" else sum(values) / len(values)
 

@@ -198,7 +198,7 @@ class Checkpoints:
         return self._open().restore(path.absolute() / "state", args=ocp.args.StandardRestore(template))
 
     def _about(self, step: int) -> About:
-        """What a checkpoint says of itself, in its own format; raises `UserError` if that is none we read."""
+        """A checkpoint's words about itself, in its own format; raises `UserError` if that is none we read."""
         path = self._path / str(step)
         try:
             about = json.loads((_older(path) if _older(path).exists() else path / _ABOUT).read_text(encoding="utf-8"))
@@ -343,7 +343,7 @@ def load_agent(
 
 
 def agent_number(program: Program, run_dir: Path, agent: int | None) -> int:
-    """Which of the agents of `run_dir` has the seed `agent` (None: the first)."""
+    """Index of the agent of `run_dir` with the seed `agent` (None: the first)."""
     if agent is None:
         return 0
     if agent not in program.seeds:
@@ -369,12 +369,12 @@ def _report(hook: Callable[[Any], Any], failure: Any) -> None:
 
 
 def _older(path: Path) -> Path:
-    """Where a checkpoint of format 2 has what is in `about.json` now."""
+    """Paths in a checkpoint of format 2 of the parts of today's `about.json`."""
     return path / "config" / "metadata"
 
 
 def _sums(path: Path) -> str:
-    """What `sha256sum` prints for all files below `path` but its `SHA256SUMS`, in the order of their names."""
+    """The output of `sha256sum` for all files below `path` but its `SHA256SUMS`, in the order of their names."""
     lines = []
     for entry in sorted(path.rglob("*")):
         if entry.is_file() and entry != path / SUMS:

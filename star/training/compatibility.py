@@ -1,4 +1,4 @@
-"""Whether a run can go on under other settings than those of its checkpoint."""
+"""Checks that a run can go on under other settings than those of its checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person sees of a run that goes on: a live view on a terminal, plain lines elsewhere."""
+"""The view of a run that goes on: a live view on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _BARS = "▁▂▃▄▅▆▇█"
 
 
 class Stopwatch:
-    """How long the parts of a run take: "epoch", "evaluation", "checkpoint". The first of each takes longer."""
+    """Durations of the parts of a run: "epoch", "evaluation", "checkpoint". The first of each takes longer."""
 
     def __init__(self, *, now: Callable[[], float] = time.monotonic) -> None:
         self._now = now
@@ -163,7 +163,7 @@ class Display:
         return Panel(Group(*parts), title=self._title, title_align="left", box=box.ROUNDED, width=width)
 
     def _head(self) -> RenderableType:
-        """What is going on, how far it is and how long it will take."""
+        """The current activity, its progress and remaining time."""
         seconds = self._stopwatch.compiling()
         if self._stopping:
             state, end = "stopping", "after this epoch"

@@ -1,4 +1,4 @@
-"""What a run would do: `star train --dry-run`. Nothing is written, and no epoch is compiled."""
+"""A preview of a run: `star train --dry-run`. Nothing is written, and no epoch is compiled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What learns, as training sees it: pure functions over the states of several seeds, and what people see of them.
+"""An experiment, as training sees it: pure functions over the states of several seeds, and views for people.
 
     class Bandit(Experiment):                    # in a file of the user's own
         steps_per_epoch = 100
@@ -32,7 +32,7 @@ from star.training.figures import measures_figure
 
 Row = Mapping[str, Any]
 PARTS = ("steps_per_epoch", "init", "epoch", "evaluate", "rows")
-"""What every experiment must have; all else has a default."""
+"""The parts that every experiment must have; all others have defaults."""
 
 
 def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -51,7 +51,7 @@ def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def numbers(evaluated: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
-    """What was evaluated, [S] by its name, as plain numbers by their names for each seed."""
+    """The evaluation, [S] by its name, as plain numbers by their names for each seed."""
     return [dict(zip(evaluated, map(float, row), strict=True)) for row in zip(*evaluated.values(), strict=True)]
 
 
@@ -62,7 +62,7 @@ def _axis(hyper: Any) -> int | None:
 
 
 class Experiment:
-    """What learns. Subclasses have at least the `PARTS`; states are pytrees with leading axes [S] of seeds."""
+    """A learning experiment. Subclasses have at least the `PARTS`; states are pytrees with axis [S] of seeds first."""
 
     steps_per_epoch: int
     """Env steps, or iterations, of one seed in one epoch."""
@@ -73,7 +73,7 @@ class Experiment:
     evaluate: Callable[..., Any]
     """(hyper, states, keys [S]) -> what `rows` takes."""
     rows: Callable[..., list[dict[str, Any]]]
-    """What was evaluated, on the host -> for each seed its measures and other numbers by their names."""
+    """The evaluation, on the host -> for each seed its measures and other numbers by their names."""
 
     def __init__(self, config: Any) -> None:
         """Make the experiment of `config`; raises `UserError` if that is not possible on this machine."""
@@ -85,7 +85,7 @@ class Experiment:
         return config
 
     def data(self) -> Any:
-        """What an epoch reads besides the state; raises `UserError` before anything is written."""
+        """The data of an epoch besides the state; raises `UserError` before anything is written."""
         return ()
 
     def tables(self, hyper: Any, state: Any, seeds: Sequence[int]) -> list[dict[str, Any]]:
@@ -101,11 +101,11 @@ class Experiment:
         return []
 
     def facts(self, rows: Sequence[Row]) -> Mapping[str, str]:
-        """What the console says of the latest epoch, besides measures."""
+        """Facts of the latest epoch for the console, besides measures."""
         return {}
 
     def placement(self, state: Any, mesh: Mesh | None, whole: Any) -> Any:
-        """Where the leaves of `state` (shapes) lie between epochs; `whole` is each of them whole on every device."""
+        """Sharding of the leaves of `state` (shapes) between epochs; `whole` has each of them whole on every device."""
         return whole
 
     def scratch(self, seeds: int) -> Mapping[str, int]:

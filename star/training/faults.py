@@ -31,7 +31,7 @@ _RATE = "learning_rate"  # ends the name of every step size
 
 @dataclass(frozen=True)
 class Fault:
-    """What is not finite after so many env steps: for each seed, tensors and metrics and how many numbers of each."""
+    """Numbers not finite after so many env steps: for each seed, tensors and metrics with the count of each."""
 
     env_steps: int
     found: Mapping[int, Mapping[str, int]]
@@ -43,7 +43,7 @@ class Fault:
 
 
 def count(state: Any, *, may_be_nan: Sequence[str] = ()) -> dict[str, jax.Array]:
-    """How many numbers of each part of `state` are not finite, as metrics `part/non_finite`."""
+    """Count of numbers not finite in each part of `state`, as metrics `part/non_finite`."""
     total: dict[str, jax.Array] = {}
     for name, leaf in _numbers(state, may_be_nan):
         key = f"{_level(name)}/{_COUNT}"
@@ -59,7 +59,7 @@ def broken(row: Row, *, may_be_nan: Sequence[str] = ()) -> dict[str, str]:
 
 
 def find(table: Sequence[Row], state: Any, *, env_steps: int, may_be_nan: Sequence[str] = ()) -> Fault | None:
-    """What is not finite after an epoch: `table` has its row of each seed, in the order of the axis of `state`."""
+    """Numbers not finite after an epoch: `table` has its row of each seed, in the order of the axis of `state`."""
     if not any(broken(row, may_be_nan=may_be_nan) for row in table):
         return None
     names, found = [name for name, _ in _numbers(state, may_be_nan)], {}

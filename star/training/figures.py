@@ -77,7 +77,7 @@ def save(figure: Figure, path: Path) -> None:
 
 
 def literal(text: str) -> str:
-    """What a user typed, for a figure.
+    """A user's text, for a figure.
 
     Matplotlib would set what is between two $ as a formula, or fail to, and leave a name that begins with _ out of
     legends.

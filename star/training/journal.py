@@ -1,4 +1,4 @@
-"""What a run writes down: JSON lines."""
+"""The journal of a run: JSON lines."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class JsonLines:
 
 @dataclass(frozen=True)
 class Journal:
-    """What a run writes down.
+    """The journal of a run.
 
     `metrics.jsonl` has a line for each epoch and seed, `<tables>.jsonl` for each evaluation and seed,
     `provenance.jsonl` for each time that the run began or went on, with the `settings` that were not those of

@@ -16,7 +16,7 @@ NAME = ".lock"
 
 
 def held(run_dir: Path) -> bool:
-    """Whether a process writes into `run_dir`, as far as the file system can tell."""
+    """True if a process writes into `run_dir`, as far as the file system can tell."""
     try:
         with (run_dir / NAME).open(encoding="utf-8") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -31,7 +31,7 @@ _LONG_S = 3.0  # of what is to come a copy of the state is worth its time; short
 
 @dataclass(frozen=True)
 class Result:
-    """How a loop, or a call of `train`, ended."""
+    """The end of a loop, or of a call of `train`."""
 
     run_dir: Path
     env_steps: int
@@ -39,9 +39,9 @@ class Result:
     score: float | None
     """Mean over seeds of the first measure in the latest evaluation."""
     terminated: bool = False
-    """Whether it was SIGTERM that interrupted it."""
+    """True if it was SIGTERM that interrupted it."""
     fault: Fault | None = None
-    """What was not finite, if that is why."""
+    """The fault, if numbers were not finite."""
     saved: int | None = None
     """Env steps of the last checkpoint."""
     began: int = 0
@@ -185,7 +185,7 @@ class Loop:
         self._saved = epochs
 
     def _left_off(self) -> Result:
-        """What SIGTERM leaves of a computation that took too long: the state before it, if there is a copy."""
+        """The state after SIGTERM in a computation that took too long: that before it, if there is a copy."""
         done = max(self._saved, 0)  # where it is, if what is short took long for once
         if self._spare is not None and self._spare[0] > self._saved:
             self._save(*self._spare)
@@ -210,7 +210,7 @@ class Loop:
         return self._done * self._program.steps_per_epoch
 
     def _is_due(self, every: int, done: int) -> bool:
-        """Whether what is done every so many epochs, and at the end, is done after `done` epochs."""
+        """True if what is done every so many epochs, and at the end, is done after `done` epochs."""
         return done % every == 0 or done == self._program.epochs
 
     def _asked(self) -> bool:
@@ -236,7 +236,7 @@ def _named(seeds: list[int]) -> str:
 
 
 def _left(program: Program, done: int) -> dict[str, int]:
-    """How many epochs, evaluations and checkpoints follow after `done` epochs; the last epoch has both."""
+    """Number of epochs, evaluations and checkpoints that follow after `done` epochs; the last epoch has both."""
 
     def count(every: int) -> int:
         return -(-program.epochs // every) - done // every if done < program.epochs else 0

@@ -1,4 +1,4 @@
-"""Where the time goes: a trace of some epochs by JAX's profiler, for Perfetto and XProf, and a stopwatch."""
+"""Profiling: a trace of some epochs by JAX's profiler, for Perfetto and XProf, and a stopwatch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is compiled of a run: the jitted functions of its experiment, and the random keys that these start from."""
+"""The compiled part of a run: the jitted functions of its experiment, and the random keys that these start from."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ class Program:
     config: Any
     """The settings of the run: those of `experiment`, or others of their structure."""
     hyper: Any
-    """What is traced: the floats of `config`, or arrays of them with the leading axis of states and keys."""
+    """The traced part: the floats of `config`, or arrays of them with the leading axis of states and keys."""
     data: Callable[[], Any]
-    """What an epoch reads besides the state, made when it is first needed; raises `UserError`."""
+    """The data of an epoch besides the state, made at its first use; raises `UserError`."""
     functions: Functions
 
     def init(self, keys: jax.Array) -> Any:
@@ -64,11 +64,11 @@ class Program:
         return self.functions.epoch(self.hyper, self.data(), state)
 
     def evaluate(self, state: Any, keys: jax.Array) -> Any:
-        """What the experiment evaluates of each state, such as greedy episodes on test goals."""
+        """The experiment's evaluation of each state, such as greedy episodes on test goals."""
         return self.functions.evaluate(self.hyper, state, keys)
 
     def rows(self, evaluated: Any) -> list[dict[str, Any]]:
-        """What was evaluated of each seed, as plain numbers with the keys of rows of metrics."""
+        """The evaluation of each seed, as plain numbers with the keys of rows of metrics."""
         return [
             {f"eval/{name}": value for name, value in row.items()}
             for row in self.experiment.rows(jax.device_get(evaluated))
@@ -143,7 +143,7 @@ def select_device(device: str) -> None:
 
 
 def structure(config: RunConfig) -> str:
-    """What runs must share to be trained `SideBySide`: everything but traced floats and the first seed."""
+    """The part that runs must share to be trained `SideBySide`: everything but traced floats and the first seed."""
     values = config.model_dump(mode="json", exclude={"trainer": {"seed"}})
     same = jax.tree.map(lambda _: 0.0, config.hyper())
     return json.dumps(values | same.model_dump(mode="json"), sort_keys=True)

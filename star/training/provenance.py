@@ -1,4 +1,4 @@
-"""Where and with what a run was made."""
+"""The provenance of a run: its place and tools."""
 
 from __future__ import annotations
 

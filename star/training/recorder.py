@@ -1,4 +1,4 @@
-"""What a run has measured so far: in its journal, since in memory the rows of a long run would grow without end."""
+"""The measurements of a run so far: in its journal, since in memory the rows of a long run would grow without end."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Recorder:
         self._notice(table)
 
     def add_tables(self, state: Any, *, env_steps: int) -> None:
-        """What the experiment writes down at an evaluation besides metrics."""
+        """The experiment's records at an evaluation besides metrics."""
         for row in self._tables(state, env_steps):
             self.journal.tables.write(row)
 

@@ -20,7 +20,7 @@ from star.training.program import Program
 
 
 def goes_back(program: Program, journal: Journal, fault: Fault, *, to: int | None, warn: Callable[[str], None]) -> bool:
-    """Whether the run goes back for a `fault`, which is said; written down it is anyway.
+    """True if the run goes back for a `fault`, which is said; written down it is anyway.
 
     `to` is the last checkpoint's env steps, None if there is no checkpoint.
     """

@@ -1,4 +1,4 @@
-"""How a run begins, or goes on: its folder and its first state. Of several processes the first one writes."""
+"""A run begins, or goes on: its folder and first state. Of several processes the first one writes."""
 
 from __future__ import annotations
 

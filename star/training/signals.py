@@ -1,4 +1,4 @@
-"""How Ctrl-C and SIGTERM end a command: at its next good moment, and at once if they come again."""
+"""Ctrl-C and SIGTERM end a command: at its next good moment, and at once if they come again."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Overdue(Exception):
 
 
 class Stop:
-    """What signals have asked for.
+    """The requests of signals.
 
     Called, it tells whether the command is to stop; `terminated` whether nobody waits for it: SIGTERM, as of a
     cluster, or SIGHUP came.
@@ -40,7 +40,7 @@ class Stop:
         self._since: float | None = None
 
     def __call__(self) -> bool:
-        """Whether a signal came."""
+        """True if a signal came."""
         return self._since is not None
 
     def hear(self, number: int, frame: FrameType | None) -> None:
@@ -51,7 +51,7 @@ class Stop:
         self.on_first()
 
     def during(self, compute: Callable[[], T]) -> T:
-        """What `compute` returns, while signals are heard: Python hears none as long as JAX compiles or waits.
+        """The value of `compute`, while signals are heard: Python hears none as long as JAX compiles or waits.
 
         It works in a thread, which is abandoned if this raises `Overdue`, or `KeyboardInterrupt` upon a second signal.
         """

@@ -1,4 +1,4 @@
-"""Where the metrics of a run go besides `metrics.jsonl`: TensorBoard and Weights & Biases.
+"""Destinations of a run's metrics besides `metrics.jsonl`: TensorBoard and Weights & Biases.
 
 A sink is told of every epoch and, at the end, of the figures. Each works in a thread of its own, and what goes wrong
 there is said in one line and ends that sink, never the training.

@@ -110,7 +110,7 @@ def _begin(
 
 
 def _epochs(state: Any) -> int:
-    """How many are over."""
+    """The number done."""
     return int(jax.device_get(state.epoch)[0])
 
 

@@ -82,7 +82,7 @@ class Tutoring(Experiment):
 
     @over_seeds
     def evaluate(self, hyper: Any, state: State, key: Array) -> dict[str, Array]:
-        """What lasts of what the students have learnt."""
+        """The lasting part of the students' learning."""
         found = _levels(state.students)
         return {name.removeprefix("students/"): value for name, value in found.items()}
 
@@ -123,7 +123,7 @@ class Tutoring(Experiment):
         return found
 
     def notes(self) -> list[str]:
-        """Where the graph comes from, if that takes its time."""
+        """The source of the graph, if finding it takes time."""
         if self.config.teaching.graph != "found":
             return []
         section = self.config.discovery

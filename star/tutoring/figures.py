@@ -93,7 +93,7 @@ def draw_graph(
 
 
 def depths(n: int, edges: Any) -> np.ndarray:
-    """How many skills lie one before the other before each of `n`, from acyclic edges (skill, prerequisite)."""
+    """Number of skills that lie one before the other before each of `n`, from acyclic edges (skill, prerequisite)."""
     deep = np.zeros(n, int)
     for _ in range(n):
         for child, parent in edges:

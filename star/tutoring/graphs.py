@@ -32,7 +32,7 @@ def draw(n: int, *, key: Array) -> Bool[Array, "n n"]:
 
 
 def depth(parents: Bool[Array, "n n"]) -> Array:
-    """How many skills lie one before the other before each skill, at most: 0 for those without prerequisites."""
+    """Number of skills that lie one before the other before each skill, at most: 0 for those without prerequisites."""
     deep = jnp.zeros(len(parents), jnp.int32)
     for _ in range(len(parents)):
         deep = jnp.where(parents, deep + 1, 0).max(axis=-1)

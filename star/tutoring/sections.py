@@ -54,7 +54,7 @@ class SkillSelectionConfig(SelectionConfig):
 
 
 class TeachingConfig(Section):
-    """How exercises are chosen."""
+    """The choice of exercises."""
 
     tutor: Literal["random", "fixed", "zpdes", "progress", "sgim_graph"] = setting(
         "sgim_graph", "This tutor chooses the exercises."
@@ -76,7 +76,7 @@ class TeachingConfig(Section):
 
 
 class DiscoveryConfig(Section):
-    """How the graph is found from the scores of earlier students."""
+    """The search for the graph from the scores of earlier students."""
 
     students: Batch = setting(400, "So many earlier students chose exercises at random.", unit="students")
     exercises: Repeats = setting(300, "Each of them chose so many.", unit="exercises")

@@ -43,7 +43,7 @@ class Course(struct.PyTreeNode):
 
 
 class Student(struct.PyTreeNode):
-    """What one student can do, and how fast it learns."""
+    """One student's ability and speed of learning."""
 
     level: Float[Array, "n"]
     """Now: what lasts, and what will fade."""

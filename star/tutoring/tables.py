@@ -25,7 +25,7 @@ _SCORES, _SKILLS = ("student", "exercise", "correct"), ("exercise", "skill")
 
 @dataclass(frozen=True)
 class Tables:
-    """What both files say; rows are sorted by student, and in the order of the file within each."""
+    """The content of both files; rows are sorted by student, and in the order of the file within each."""
 
     skills: list[str]
     students: int

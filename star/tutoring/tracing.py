@@ -69,7 +69,7 @@ def discover(config: DiscoveryConfig, needs: Bool[Array, "E n"], scores: Scores,
 
 
 def features(needs: Bool[Array, "E n"], scores: Scores) -> Float[Array, "N F n"]:
-    """What each student has shown of each skill before each score."""
+    """Evidence of each student for each skill before each score."""
     n = needs.shape[1]
     rates = jnp.asarray(RATES)[:, None]
     none = (jnp.zeros((2, n)), jnp.zeros((len(RATES), n)))

@@ -39,23 +39,23 @@ EXPLORES = 0.2  # share of its choices that are made evenly
 
 
 class Plan(struct.PyTreeNode):
-    """What a tutor knows of a course."""
+    """A tutor's knowledge of a course."""
 
     needs: Bool[Array, "E n"]
     parents: Bool[Array, "n n"]
 
 
 class Seen(struct.PyTreeNode):
-    """What every tutor remembers of a student."""
+    """Every tutor's memory of a student."""
 
     success: Float[Array, "n"]
     """Running success of each skill."""
     own: Any
-    """What one tutor remembers besides."""
+    """One tutor's own memory."""
 
 
 class Tutor(NamedTuple):
-    """How one tutor chooses."""
+    """One tutor's choice."""
 
     init: Callable[[TeachingConfig, int], Any]
     """(settings, n) -> its own memory"""
@@ -76,7 +76,7 @@ def choose(config: TeachingConfig, plan: Plan, seen: Seen, *, key: Array) -> Int
 
 
 def update(config: TeachingConfig, plan: Plan, seen: Seen, exercise: Int[Array, ""], score: Bool[Array, ""]) -> Seen:
-    """What is known after an exercise."""
+    """The knowledge after an exercise."""
     needed = plan.needs[exercise]
     success = seen.success + jnp.where(needed, config.rate * (score - seen.success), 0.0)
     own = TUTORS[config.tutor].learn(config, plan, seen, success, needed, score)
@@ -143,7 +143,7 @@ def _order(plan: Plan) -> Int[Array, "n"]:
 
 
 class Quality(struct.PyTreeNode):
-    """What ZPDES remembers of each skill."""
+    """ZPDES's memory of each skill."""
 
     scores: Float[Array, "n RECENT"]
     """The latest scores, the newest last; 0 before the first."""

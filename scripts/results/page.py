@@ -1,0 +1,382 @@
+"""Make docs/results.md, its charts, and the tables of README and docs/hardware.md from the JSON files in results/.
+
+    python scripts/results/page.py            write the page, its charts and the table
+    python scripts/results/page.py --digests  first ask how all rows with a digest would learn today
+
+A row is a JSON of scripts/results/reproduce.py. Today's digests are kept in results/digests.json, with the commit that
+they are of. A row without a digest, or with another than today's, is marked as of an older version.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import subprocess
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from scripts.pages import charts
+from scripts.results import digest
+from star.report import statistics
+from star.training.journal import JsonLines
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "results"
+DIGESTS = RESULTS / "digests.json"
+BEGIN, END = "<!-- made by scripts/results/page.py -->", "<!-- made until here -->"
+MARK = "†"
+
+# The name of a task, the row that answers for it, and the published success (arXiv 2401.09870).
+TASKS = (
+    ("Ant Maze", "ant_maze/one_by_one/star", ".84"),
+    ("Ant Maze Cam", "ant_maze_cam/one_by_one/star", ".74"),
+    ("Ant Fall", "ant_fall/one_by_one/star", ".31"),
+    ("labyrinth, 112 m", "ant_labyrinth/star", ""),
+    ("Ant Maze, no GPU", "ant_maze_cpu/star", ""),
+    ("Ant Fall, no GPU", "ant_fall_cpu/star", ""),
+    ("Point Maze, no GPU", "point_maze/star", ""),
+)
+FOLDERS = {"Ant Maze": "ant_maze", "Ant Maze Cam": "ant_maze_cam", "Ant Fall": "ant_fall", "labyrinth": "ant_labyrinth"}
+AGENTS = {"STAR": "star", "GARA": "gara", "HIRO": "hiro", "HRAC": "hrac", "flat": "flat"}
+REFINED = {
+    "labyrinth": "ant_labyrinth",
+    "big maze": "ant_big_maze",
+    "four rooms": "ant_4rooms",
+    "sparse Ant Maze": "ant_maze_sparse",
+    "hardest maze": "ant_hardest_maze",
+    "Point Maze, wrong boxes": "point_maze/wrong_boxes",
+}
+PARTS = {
+    "STAR": "star",
+    "grid of 6 x 6": "grid",
+    "no reachability mask": "no_mask",
+    "cuts at random": "random_cuts",
+    "reached regions": "reached_regions",
+    "no refinement": "no_refinement",
+}
+
+
+class Row(NamedTuple):
+    """A measured agent: its JSON, and whether its digest is today's."""
+
+    path: str
+    report: Mapping[str, Any]
+    today: bool
+
+    @property
+    def scores(self) -> np.ndarray:
+        """success_any of each seed."""
+        return np.asarray([seed["success_any"] for seed in self.report["seeds"]])
+
+    @property
+    def interval(self) -> tuple[float, float, float]:
+        """Mean, low and high over seeds; the three are one number where there is one seed."""
+        mean, low, high = statistics.over_seeds(self.scores, episodes=self.report["seeds"][0]["episodes"])
+        return float(mean), float(np.nan_to_num(low, nan=mean)), float(np.nan_to_num(high, nan=mean))
+
+    @property
+    def mark(self) -> str:
+        """The mark behind the name of a row of an older version."""
+        return "" if self.today else f" {MARK}"
+
+
+def read(results: Path = RESULTS) -> dict[str, Row]:
+    """All rows below `results`, by their path without ending."""
+    kept = results / DIGESTS.name
+    today = json.loads(kept.read_text(encoding="utf-8"))["rows"] if kept.exists() else {}
+    rows = {}
+    for path in sorted(results.rglob("*.json")):
+        report = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(report, dict) and {"task", "name", "seeds", "runs"} <= report.keys():
+            name = path.relative_to(results).with_suffix("").as_posix()
+            same = (digest.same(run.get("digest"), today.get(name)) for run in report["runs"])
+            rows[name] = Row(name, report, all(same))
+    return rows
+
+
+def table(rows: Mapping[str, Row]) -> str:
+    """Five narrow columns: what STAR reaches in each task, how soon, and on what."""
+    lines = ["| task | success | published | to .9 | on |", "|---|---|---|---|---|"]
+    for task, path, published in TASKS:
+        if row := rows.get(path):
+            seeds = row.report["seeds"]
+            on = f"{_device(row)}, {len(seeds)} seed{'s' * (len(seeds) > 1)}"
+            lines.append(f"| {task}{row.mark} | {_success(row)} | {published} | {_soon(row)} | {on} |")
+    return "\n".join(lines) + "\n"
+
+
+def _success(row: Row) -> str:
+    mean, low, high = (_share(x) for x in row.interval)
+    return f"**{mean}** [{low}, {high}]"
+
+
+def _share(value: float) -> str:
+    return f"{value:.2f}".removeprefix("0")
+
+
+def _device(row: Row) -> str:
+    device = row.report["runs"][-1]["device"]
+    return "2 CPU cores" if device.startswith("CPU") else re.sub(r"^NVIDIA (\w+).*", r"\1", device)
+
+
+def _soon(row: Row) -> str:
+    """Median of the training seconds to success .9."""
+    times = [seed.get("training_seconds_to_level") for seed in row.report["seeds"]]
+    middle = float(np.median([np.inf if time is None else time for time in times]))
+    return f"{middle:.0f} s" if np.isfinite(middle) else "not noted" if "level" not in row.report else "never"
+
+
+def hardware(rows: Mapping[str, Row]) -> str:
+    """A table of what trains on what, and how fast."""
+    lines = ["| task | on | env steps/s | env steps a seed | seeds | minutes |", "|---|---|---|---|---|---|"]
+    for task, path, _ in TASKS:
+        if row := rows.get(path):
+            speed = float(np.median([run["env_steps_per_s"] for run in row.report["runs"]]))
+            steps, seeds = row.report["env_steps_per_seed"], len(row.report["seeds"])
+            told = (f"{speed / 1e6:.2f} M", f"{steps / 1e6:.1f} M", str(seeds), f"{steps * seeds / speed / 60:.1f}")
+            lines.append(f"| {task}{row.mark} | {_device(row)} | {' | '.join(told)} |")
+    return "\n".join(lines) + "\n"
+
+
+def verdicts(rows: Mapping[str, Row]) -> list[str]:
+    """A line for each task and rival: whether STAR is ahead, by Welch's interval of the difference."""
+    lines = []
+    for task, folder in FOLDERS.items():
+        ours = rows.get(f"{folder}/star")
+        for agent, name in list(AGENTS.items())[1:]:
+            theirs = rows.get(f"{folder}/{name}")
+            if ours and theirs:
+                lines.append(f"| {agent}{theirs.mark}, {task} | {_difference(ours, theirs)} |")
+    return lines
+
+
+def _difference(ours: Row, theirs: Row) -> str:
+    episodes = min(row.report["seeds"][0]["episodes"] for row in (ours, theirs))
+    found = statistics.difference({"": list(ours.scores)}, {"": list(theirs.scores)}, episodes=episodes)
+    assert found is not None
+    mean, low, high = found
+    word = "ahead" if low > 0 else "behind" if high < 0 else "not told apart"
+    return f"{word} | {mean:+.2f} [{low:+.2f}, {high:+.2f}]"
+
+
+def unmeasured(rows: Mapping[str, Row]) -> str:
+    """The agents without a row, with their tasks."""
+    missing = {
+        agent: [task for task, folder in FOLDERS.items() if f"{folder}/{name}" not in rows]
+        for agent, name in AGENTS.items()
+    }
+    everywhere = len(FOLDERS)
+    return "; ".join(
+        agent if len(tasks) == everywhere else f"{agent} on {', '.join(tasks)}"
+        for agent, tasks in missing.items()
+        if tasks
+    )
+
+
+def page(rows: Mapping[str, Row]) -> str:
+    """The text of docs/results.md."""
+    shown = list(dict.fromkeys(path for chart in charted(rows).values() for path in chart))
+    shown += [path for _, path, _ in TASKS if path in rows and path not in shown]
+    older = sum(not rows[path].today for path in shown)
+    missing = unmeasured(rows)
+    return f"""# Results
+
+{BEGIN}
+
+`python scripts/results/page.py` makes this page from the JSON files in `results/`. {_age(older, len(shown))}
+
+## Success and time
+
+{table(rows)}
+* *success*: share of greedy episodes that reach the test goal, mean over seeds with a
+  [95 % interval](evaluation.md#intervals). Each seed plays 100 or 200 episodes with starts unseen in training.
+* *published*: the same in the [paper](https://arxiv.org/abs/2401.09870), after 10 to 13 hours of training.
+* *to .9*: median over seeds of the seconds of training to a success of .9, without compilation and evaluation.
+* Seeds of the first three tasks trained one by one, those of other rows side by side.
+
+## Beside other agents
+
+![Success of STAR and other agents on four ant tasks](images/results_agents.png)
+
+| STAR beside | STAR is | difference in success |
+|---|---|---|
+{chr(10).join(verdicts(rows))}
+
+Bars are means over seeds, lines 95 % intervals. Differences have Welch's interval. GARA here is STAR without its Tutor.
+{f"Not measured: {missing}." if missing else ""}
+Older figures of HIRO are in the [notebook](notebook/results.md#hiro-and-hrac-anew).
+
+![Success of STAR and GARA over env steps](images/results_curves.png)
+
+Curves are means over seeds; bands hold all seeds. In the labyrinth STAR pays for
+[tilts](notebook/departures.md#tutor-and-controller) and GARA does not, as GARA is better so.
+
+## Worth of refinement
+
+![Success with and without refinement in six mazes](images/results_refinement.png)
+
+The last pair starts from four boxes that follow no wall. If the first boxes follow the walls, refinement changes
+[nothing](notebook/results.md#what-each-part-is-worth).
+
+![Success in the labyrinth as parts of STAR are left out](images/results_parts.png)
+
+The variants of the labyrinth trained for fewer env steps than STAR. A fixed grid does well too, if its size is right.
+
+## Other learners
+
+[SGIM beside STAR alone](sgim.md#what-it-does-there), [SGIM-SAHT in worlds](saht.md) and [tutors of simulated
+students](tutoring.md) have their figures on their own pages.
+
+## Measure a row again
+
+```bash
+python scripts/results/reproduce.py ant_maze/one_by_one/star ant_labyrinth/gara  # GPU
+python scripts/results/page.py --digests
+```
+
+The first command goes on where it was interrupted. A row holds its seeds, command, commit, device, versions and
+*learning digest*: how far three tiny epochs of its config move the agent. The digest tells whether the code of today
+learns as the measured code did. `results/README.md` lists all raw figures. Earlier measurements and attempts are in the
+[notebook](notebook/results.md).
+"""
+
+
+def _age(older: int, count: int) -> str:
+    if not older:
+        return "All rows are of the agent of today."
+    which = "All rows are" if older == count else f"{older} of {count} rows are"
+    return f"{which} **of an older version** of the agent ({MARK}): no learning digest of today."
+
+
+def charted(rows: Mapping[str, Row]) -> dict[str, list[str]]:
+    """The rows in each chart that are there."""
+    wanted = {
+        "agents": [f"{folder}/{name}" for folder in FOLDERS.values() for name in AGENTS.values()],
+        "refinement": [f"{folder}/{name}" for folder in REFINED.values() for name in ("star", "no_refinement")],
+        "parts": [f"ant_labyrinth/{name}" for name in PARTS.values()],
+    }
+    return {chart: [path for path in paths if path in rows] for chart, paths in wanted.items()}
+
+
+def bars(rows: Mapping[str, Row], groups: Sequence[str], names: Mapping[str, str], paths: Any) -> Figure:
+    """Bars of success for each of `groups`, one for each of `names` (label: what `paths` takes after the group)."""
+    figure = Figure(figsize=(8.2, 2.9), layout="constrained")
+    axis = figure.subplots()
+    names = {label: name for label, name in names.items() if any(paths(group, name) in rows for group in groups)}
+    width = 0.8 / len(names)
+    for number, (label, name) in enumerate(names.items()):
+        places, middles, spans = [], [], []
+        for place, group in enumerate(groups):
+            if row := rows.get(paths(group, name)):
+                mean, low, high = row.interval
+                places.append(place + (number - (len(names) - 1) / 2) * width)
+                middles.append(mean)
+                spans.append((mean - low, high - mean))
+                if mean < 0.005:  # a bar that nobody would see
+                    axis.annotate("0", (places[-1], 0.01), ha="center")
+        axis.bar(places, middles, width, yerr=np.transpose(spans) if spans else None, capsize=2, label=label)
+    axis.set_xticks(range(len(groups)), [textwrap.fill(group, 13) for group in groups])
+    axis.set(ylabel="success", ylim=(0, 1.05))
+    axis.grid(axis="y", alpha=0.3)
+    axis.set_axisbelow(True)
+    if len(names) > 1:
+        figure.legend(*axis.get_legend_handles_labels(), loc="outside right center")
+    return figure
+
+
+def curves(results: Path) -> Figure:
+    """Success of STAR and GARA over env steps in four tasks: mean and range of the seeds."""
+    figure = Figure(figsize=(8.2, 2.6), layout="constrained")
+    axes = figure.subplots(1, len(FOLDERS), sharey=True)
+    for axis, (task, folder) in zip(axes, FOLDERS.items(), strict=True):
+        points = JsonLines(results / folder / "curves.jsonl").read()
+        for number, (label, name) in enumerate(list(AGENTS.items())[:2]):
+            mine = [point for point in points if point["name"] == name]
+            steps = sorted({point["env_steps"] for point in mine})
+            at = [[p["eval/success_any"] for p in mine if p["env_steps"] == step] for step in steps]
+            million = np.asarray(steps) / 1e6
+            axis.plot(million, [np.mean(seeds) for seeds in at], color=f"C{number}", label=label)
+            low, high = [min(seeds) for seeds in at], [max(seeds) for seeds in at]
+            axis.fill_between(million, low, high, color=f"C{number}", alpha=0.15, linewidth=0)
+        axis.set(title=task, ylim=(-0.02, 1.02))
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("success")
+    figure.supxlabel("million env steps of each seed", fontsize="medium")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
+    return figure
+
+
+def drawn(rows: Mapping[str, Row], results: Path = RESULTS) -> dict[str, Figure]:
+    """The charts of the page."""
+
+    def refined(group: str, name: str) -> str:
+        return f"{REFINED[group]}/{name}"
+
+    pair = {"refined": "star", "not refined": "no_refinement"}
+    return {
+        "results_agents": bars(rows, list(FOLDERS), AGENTS, lambda task, name: f"{FOLDERS[task]}/{name}"),
+        "results_curves": curves(results),
+        "results_refinement": bars(rows, list(REFINED), pair, refined),
+        "results_parts": bars(rows, list(PARTS), {"": ""}, lambda part, _: f"ant_labyrinth/{PARTS[part]}"),
+    }
+
+
+def sources(rows: Mapping[str, Row], results: Path = RESULTS) -> str:
+    """A hash of all figures that the charts show; each chart carries it."""
+    shown = {path: list(map(float, rows[path].scores)) for paths in charted(rows).values() for path in paths}
+    told = hashlib.sha256(json.dumps(shown, sort_keys=True).encode())
+    for folder in FOLDERS.values():
+        points = JsonLines(results / folder / "curves.jsonl").read()
+        told.update(json.dumps([p for p in points if p["name"] in list(AGENTS.values())[:2]]).encode())
+    return told.hexdigest()[:16]
+
+
+def with_table(text: str, made: str) -> str:
+    """A page with another table between its two marks."""
+    before, rest = text.split(BEGIN)
+    return f"{before}{BEGIN}\n{made}{END}{rest.split(END)[1]}"
+
+
+def tables(rows: Mapping[str, Row]) -> dict[str, str]:
+    """The tables of other pages."""
+    return {"README.md": table(rows), "docs/hardware.md": hardware(rows)}
+
+
+def renew(rows: Mapping[str, Row]) -> None:
+    """Write today's digests of all rows that have one."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, check=True, capture_output=True, text=True
+    )
+    found: dict[str, Any] = {"commit": commit.stdout.strip(), "rows": {}}
+    for path, row in rows.items():
+        if any("digest" in run for run in row.report["runs"]):
+            found["rows"][path] = digest.of(row.report["runs"][-1]["command"])
+            print(f"{path}: {found['rows'][path]}", flush=True)
+    DIGESTS.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    """Write the page, its charts and the tables of other pages."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--digests", action="store_true", help="renew results/digests.json: a minute a row")
+    options = parser.parse_args()
+    if options.digests:
+        renew(read())
+    rows = read()
+    (ROOT / "docs" / "results.md").write_text(page(rows), encoding="utf-8")
+    for name, made in tables(rows).items():
+        text = (ROOT / name).read_text(encoding="utf-8")
+        (ROOT / name).write_text(with_table(text, made), encoding="utf-8")
+    for name, figure in drawn(rows).items():
+        charts.save(figure, name, dpi=80, of=sources(rows))
+
+
+if __name__ == "__main__":
+    main()
