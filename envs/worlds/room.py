@@ -103,7 +103,7 @@ def step(room: Room, state: RoomState, action: Float[Array, "2"]) -> RoomState:
 
     def substep(_: Array, places: Array) -> Array:
         places = places.at[0].add(move)
-        for _ in range(ROUNDS):
+        for _round in range(ROUNDS):
             places = _clear(room, _apart(places, push))
         return _clear(room, _apart(places, yielding))
 

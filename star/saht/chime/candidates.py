@@ -6,9 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from envs.worlds.room import Room
 from star.saht.chime import memory as memories
 from star.saht.chime import models
 from star.saht.chime.memory import Memory
@@ -21,9 +23,11 @@ COPIES = 0.5
 """This share of candidates are copies of a model with other inputs; the rest are new."""
 INPUTS = (0.3, 0.5, 0.2)
 """New models have none, one or two contexts with these chances."""
+TRANSFER = 0.5
+"""This share of new models whose control is an observable begin as another such model, with the roles exchanged."""
 CURIOUS = 0.05
 """The chance of an input that tells nothing, in units of that of the one that tells most."""
-DICE = 8
+DICE = 10
 ALWAYS = 0.9
 
 
@@ -134,7 +138,7 @@ def telling(memory: Memory, among: Bool[Array, "N"], outcome: Array, control: Ar
 
 
 def renew(
-    config: ChimeConfig, population: Population, memory: Memory, among: Bool[Array, "N"], *, key: Array
+    config: ChimeConfig, room: Room, population: Population, memory: Memory, among: Bool[Array, "N"], *, key: Array
 ) -> Population:
     """The population with a new candidate in each place that is free."""
     slots, inputs = config.models, population.models.context.shape[-1]
@@ -150,10 +154,14 @@ def renew(
     outcome = jnp.where(copy, old.outcome, pair // width)
     control = jnp.where(copy, old.control, jnp.where(pair % width == width - 1, ACTION, pair % width))
     tells = telling(memory, among, outcome, control) + CURIOUS
-    context = jnp.where(copy[:, None], _varied(old.context, tells, dice[3:6]), _chosen(tells, dice[5:8]))
     fresh = models.init(inputs, config.candidates, key=weight_key)
-    inherited = _inherited(old, fresh)
-    weights = _either(copy, inherited, fresh)
+    nested = active & (population.models.control[:slots] != ACTION)
+    like = jax.tree.map(lambda leaf: leaf[jax.vmap(lambda die: drawn(1.0 * nested, die))(dice[8])], population.models)
+    like = jax.vmap(lambda *given: in_the_roles_of(room, *given))(like, outcome, control)
+    transfer = ~copy & nested.any() & (control != ACTION) & (dice[9] < TRANSFER)
+    context = jnp.where(copy[:, None], _varied(old.context, tells, dice[3:6]), _chosen(tells, dice[5:8]))
+    context = jnp.where(transfer[:, None], like.context, context)
+    weights = _either(copy, _inherited(old, fresh), _either(transfer, like.weights, fresh))
     moments = _either(copy, jax.tree.map(lambda leaf: leaf[slot], population.moments), jax.vmap(OPTIMISER.init)(fresh))
     nothing = jnp.zeros(config.candidates, jnp.int32)
     made = Population(
@@ -170,6 +178,30 @@ def renew(
     there = jax.tree.map(lambda leaf: leaf[slots:], population)
     mixed = _either(there.active, there, made)
     return jax.tree.map(lambda leaf, new: leaf.at[slots:].set(new), population, mixed)
+
+
+def in_the_roles_of(room: Room, model: Model, outcome: Int[Array, ""], control: Int[Array, ""]) -> Model:
+    """The same model with other discs in the roles of outcome and control; the others change places accordingly.
+
+    What one disc sees of another is turned around where the order of a pair is.
+    """
+    count, names = len(room.discs), len(room.names)
+    discs = jnp.arange(count)
+    for before, after in ((model.control, control), (model.outcome, outcome)):
+        there = jnp.argmax(discs == after)
+        discs = discs.at[there].set(discs[before]).at[before].set(after)
+    first, second = np.array(room.pairs).T
+    numbers = np.zeros((count, count), int)
+    numbers[first, second] = numbers[second, first] = names + np.arange(len(first))
+    colours = jnp.where(discs[1:] > 0, count + discs[1:] - 1, len(room.contexts))  # the robot has no colour
+    place = jnp.concatenate([discs, colours, jnp.asarray(numbers)[discs[first], discs[second]]])
+    turned = jnp.where(discs[first] < discs[second], 1.0, -1.0)
+    sign = jnp.repeat(jnp.concatenate([jnp.ones(names), turned]), 2)[:, None]
+    old = model.weights.context
+    number = (2 * place[:, None] + jnp.arange(2)).ravel()
+    moved = jnp.zeros_like(old).at[number].set(sign * old, mode="drop")
+    context = jnp.zeros_like(model.context).at[place].set(model.context, mode="drop")
+    return Model(outcome, control, context, model.weights.replace(context=moved))
 
 
 def _either(which: Bool[Array, "E"], one: Any, other: Any) -> Any:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from envs.worlds.room import Room
 from star.saht.chime import candidates, models
 from star.saht.chime import memory as memories
 from star.saht.chime.candidates import NOBODY, Population, controllable, leads
@@ -42,7 +43,7 @@ class Judged(struct.PyTreeNode):
 
 
 def evolve(
-    config: ChimeConfig, population: Population, memory: Memory, births: Int[Array, "B B+1"], *, key: Array
+    config: ChimeConfig, room: Room, population: Population, memory: Memory, births: Int[Array, "B B+1"], *, key: Array
 ) -> tuple[Population, Int[Array, "B B+1"]]:
     """The population, and the first births of each outcome by each control, after an evolution."""
     learn_key, judge_key, draw_key = jax.random.split(key, 3)
@@ -54,7 +55,7 @@ def evolve(
     population = population.replace(competence=jnp.where(population.born != NOBODY, slow, now))
     population, births = succeed(config, population, judged, births, now=memory.written)
     population = switch(config, population, judged)
-    return candidates.renew(config, population, memory, kept, key=draw_key), births
+    return candidates.renew(config, room, population, memory, kept, key=draw_key), births
 
 
 def learn(

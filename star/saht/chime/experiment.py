@@ -21,7 +21,7 @@ from star.saht.chime.sections import Config, Learner
 from star.training.experiment import Experiment, numbers, over_seeds
 from star.training.journal import mean
 
-ACTIONS = 40
+ACTIONS = 30
 """Of a test."""
 REACHED = 20.0
 """A test is a success if the disc ends so near to the goal, in units of the room: its radius; half of it for a push."""
@@ -137,7 +137,8 @@ def tested(
     """
     slots = hyper.chime.models
 
-    def one(places: Array, disc: Array, goal: Array, key: Array) -> Array:
+    def one(errand: Any, key: Array) -> Array:
+        places, disc, goal = errand
         world = RoomState(places, jnp.zeros((len(room.discs) - 1, 2)))
         slot = planner.best_slot(state.population, disc, slots)
         able = state.population.enabled[slot] & (state.population.models.outcome[slot] == disc)
@@ -145,4 +146,4 @@ def tested(
         return jnp.concatenate([values[:, : len(room.discs)], world.places[None]])
 
     columns = [jnp.array([getattr(errand, name) for errand in errands]) for name in ("places", "disc", "goal")]
-    return jax.vmap(one)(*columns, jax.random.split(key, len(errands)))
+    return jax.vmap(one)(columns, jax.random.split(key, len(errands)))

@@ -76,7 +76,7 @@ def init(config: ChimeConfig, room: Room, *, key: Array) -> State:
 
 
 def _given(room: Room, population: Population, births: Array) -> tuple[Population, Array]:
-    """All tasks that can be learnt: the robot, each object by it, and each object by those before, with their inputs."""
+    """All tasks that can be learnt, with inputs: the robot, each object by it, and each object by those before."""
     objects = range(1, 1 + room.movable)
     tasks = [(0, ACTION), *((i, 0) for i in objects), *((j, i) for i in objects for j in objects if i < j)]
     outcome, control = jnp.array(tasks, jnp.int32).T
@@ -109,7 +109,7 @@ def act(
     actions: int,
     key: Array,
 ) -> tuple[RoomState, Rows, Float[Array, "n B 2"]]:
-    """The room after so many actions, planned for an aim or random, and what was seen and done, with the observables."""
+    """The room after so many actions, planned or random; what was seen and done; and the observables before each."""
 
     def part(known: tuple[RoomState, Array], key: Array) -> tuple[tuple[RoomState, Array], Any]:
         world, before = known
@@ -170,7 +170,7 @@ def epoch(config: ChimeConfig, room: Room, state: State) -> tuple[State, Seen]:
     seen = Seen(blocks.spent.sum(axis=0), blocks.moved.mean(axis=0))
     if config.tasks != "none":
         before = state.population
-        population, births = evolution.evolve(config, before, state.memory, state.births, key=evolve_key)
+        population, births = evolution.evolve(config, room, before, state.memory, state.births, key=evolve_key)
         choice = told(config, state.choice, before, population, seen.spent)
         state = state.replace(population=population, births=births, choice=choice)
     return state.replace(epoch=state.epoch + 1), seen

@@ -21,7 +21,7 @@ class Memory(struct.PyTreeNode):
     values: Float[Array, "N B 2"]
     """Observables before each action."""
     moved: Bool[Array, "N B+1"]
-    """Which observables have moved; the last one is the action, which counts as moved. Nothing where none is written."""
+    """Which observables have moved; the last one is the action, which counts as moved, but where none is written."""
     written: Int[Array, ""]
     """Actions since the beginning."""
 
@@ -38,12 +38,12 @@ def empty(size: int, observables: int, inputs: int) -> Memory:
 
 def write(memory: Memory, rows: Rows, values: Float[Array, "n B 2"]) -> Memory:
     """The memory after n more actions, over the oldest ones; n divides its size."""
-    moved = jnp.abs(rows.change).max(axis=-1) > STILL
+    n, moved = len(values), jnp.abs(rows.change).max(axis=-1) > STILL
     new = rows, values, jnp.pad(moved, ((0, 0), (0, 1)), constant_values=True)
     place = memory.written % len(memory.values)
     old = memory.rows, memory.values, memory.moved
-    put = [jax.tree.map(lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, place, 0), old, new)]
-    return Memory(*put[0], memory.written + len(values))
+    rows, values, moved = jax.tree.map(lambda x, y: jax.lax.dynamic_update_slice_in_dim(x, y, place, 0), old, new)
+    return Memory(rows=rows, values=values, moved=moved, written=memory.written + n)
 
 
 def parts(memory: Memory) -> tuple[Bool[Array, "N"], Bool[Array, "N"]]:

@@ -84,7 +84,7 @@ def predict(model: Model, rows: Rows) -> Float[Array, "*n 2"]:
 
 
 def error(predicted: Float[Array, "n 2"], change: Float[Array, "n 2"]) -> Float[Array, ""]:
-    """The length of all errors over that of all changes: 0 is perfect, 1 is as good as to predict that nothing moves."""
+    """The length of all errors over that of all changes: 0 is perfect, 1 is as good as predicting no change."""
     off, moved = (jnp.sqrt(jnp.square(x).sum(axis=-1)).sum() for x in (predicted - change, change))
     return jnp.where(moved > 0, off / jnp.where(moved > 0, moved, 1.0), 1.0)
 

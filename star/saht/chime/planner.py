@@ -1,12 +1,12 @@
 """Plans through nested models: what has to be so first, and the actions that bring about both.
 
-A goal is a place of one observable. If another observable controls the model of that one, its change has the effect only
-where both are in the right places: for a push, on the side away from the goal. Where that is was remembered. So the plan
-has levels, from the goal down to the observable that the action controls.
+A goal is a place of one observable. If another observable controls the model of that one, its change has the effect
+only where both are in the right places: for a push, on the side away from the goal. Where that is, was remembered. So
+the plan has levels, from the goal down to the observable that the action controls.
 
-    levels    of remembered changes of the outcome the one that fits what is needed; where the control was then, and how it
-              changed, is what is needed of the control, one level below
-    imagine   all models together, from what is seen now: first what the action changes, then what that changes, ...
+    levels    of remembered changes of the outcome the one that fits what is needed; the control has to go where it was
+              then, and once it is there, to change as it did: its goal, one level below
+    imagine   all models together, from what is seen now: what the action changes, then what that changes, ...
     plan      actions by the cross-entropy method: a few of one kind, some of another, more of a third
 
 Source: CHIME (Manoury, Nguyen, Buche, arXiv 2009.10968) plans through nested models; how is ours.
@@ -40,11 +40,13 @@ FIRST = 0.3
 
 
 class Level(NamedTuple):
-    """Where discs have to be first, seen from one another."""
+    """What has to be so first."""
 
-    apart: Float[Array, "P 2"]
-    wanted: Bool[Array, "P"]
-    """Which pairs of discs matter; none if the action is the control, or nothing is remembered."""
+    control: Int[Array, ""]
+    goal: Float[Array, "2"]
+    """Of the control."""
+    used: Bool[Array, ""]
+    """Whether there is such a level: the action is no control, and something is remembered."""
 
 
 class Aim(NamedTuple):
@@ -79,15 +81,14 @@ def levels(
         aside = jnp.sqrt(jnp.maximum(jnp.square(effect).sum(axis=-1) - along**2, 0.0))
         apart = rooms.apart(room, memory.values[rows])  # [R, P, 2]
         wanted = context[len(room.names) :] & (pairs == outcome).any(axis=-1) & (pairs == control).any(axis=-1)
-        wanted &= used & there.any()
+        used &= there.any()
         way = jnp.sqrt(jnp.square((apart - now) * wanted[:, None]).sum(axis=(-1, -2)))
         best = jnp.argmax(jnp.minimum(along, length) - aside - 0.05 * way)
-        # the control has to go there; and where it is there, to change so
         sign = jnp.where(pairs[:, 0] == control, -1.0, 1.0)
         move = ((apart[best] - now) * (sign * wanted)[:, None]).sum(axis=0)
         then = memory.rows.change[rows[best], control] * room.units[control]
         goal = values[control] + jnp.where(jnp.square(move).sum() < CLOSE**2, then, move)
-        return (Aim(best_slot(population, control, slots), goal), used), Level(apart[best], wanted)
+        return (Aim(best_slot(population, control, slots), goal), used), Level(control, goal, used)
 
     return jax.lax.scan(level, (aim, jnp.ones((), bool)), jax.random.uniform(key, (DEPTH, ROWS)))[1]
 
@@ -119,13 +120,12 @@ def imagine(
 
 
 def cost(
-    room: Room, first: Level, outcome: Int[Array, ""], goal: Float[Array, "2"], path: Float[Array, "T B 2"]
+    first: Level, outcome: Int[Array, ""], goal: Float[Array, "2"], path: Float[Array, "T B 2"]
 ) -> Float[Array, ""]:
-    """How far a path is from the goal, on the way and in the end, and from what has to be so first."""
-    off = jnp.sqrt(jnp.square(path[:, outcome] - goal).sum(axis=-1) + 1e-6)
-    apart = rooms.apart(room, path)[:, None] - first.apart  # [T, DEPTH, P, 2]
-    away = jnp.sqrt(jnp.square(apart).sum(axis=-1) + 1e-6) * first.wanted
-    return off.mean() + off[-1] + FIRST * away.sum(axis=(-1, -2)).mean()
+    """How far a path is from the goal, on the way and in the end, and from what has to be so `first` [DEPTH]."""
+    off = jnp.sqrt(jnp.square(path[:, outcome] - goal).sum(axis=-1))
+    away = jnp.sqrt(jnp.square(path[:, first.control] - first.goal).sum(axis=-1)) * first.used  # [T, DEPTH]
+    return off.mean() + off[-1] + FIRST * away.sum(axis=-1).mean()
 
 
 def plan(
@@ -146,7 +146,7 @@ def plan(
 
     def value(parts: Array) -> Array:
         actions = jnp.repeat(parts, SEGMENTS, axis=0, total_repeat_length=int(SEGMENTS.sum()))
-        return cost(room, first, outcome, aim.goal, imagine(room, population, values, actions, slots=slots))
+        return cost(first, outcome, aim.goal, imagine(room, population, values, actions, slots=slots))
 
     def cycle(known: Any, given: tuple[Array, Array]) -> tuple[Any, None]:
         best, mean, deviation = known
