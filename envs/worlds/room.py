@@ -200,4 +200,4 @@ def errands(room: Room) -> tuple[Errand, ...]:
         Errand("push", ((_MIDDLE[0], 165.0), _MIDDLE, *west[1:]), 1, (_MIDDLE[0] + x, _MIDDLE[1] + y))
         for x, y in ((_PUSH, 0.0), (-_PUSH, 0.0), (0.0, _PUSH), (0.0, -_PUSH))
     ]
-    return (*around, *behind, *(pushes if room.movable else []))
+    return (*around, *(behind if room.wall else ()), *(pushes if room.movable else ()))

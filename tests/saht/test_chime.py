@@ -22,6 +22,11 @@ ROOM = Room(movable=2, fixed=1)
 NAMES, INPUTS = len(ROOM.names), len(ROOM.contexts)
 CONFIG = ChimeConfig(models=4, candidates=3, few=4)
 
+possible, succeed, switch = (jax.jit(x) for x in (candidates.possible, evolution.succeed, evolution.switch))
+in_the_roles_of = jax.jit(candidates.in_the_roles_of, static_argnums=0)
+imagine = jax.jit(planner.imagine, static_argnums=0, static_argnames="slots")
+levels = jax.jit(planner.levels, static_argnums=0, static_argnames="slots")
+
 
 def slow_step(room, places, action):
     """One action, pair by pair."""
@@ -159,7 +164,7 @@ def test_a_model_in_other_roles_predicts_the_same_of_discs_that_have_changed_pla
     one = one._replace(context=one.context & (jnp.arange(INPUTS) != ROOM.contexts.index("colour_object_1")))
     values = values_of(random.key(4), 5)
     for outcome, control in ((2, 1), (2, 0), (1, 2)):
-        other = candidates.in_the_roles_of(ROOM, one, jnp.int32(outcome), jnp.int32(control))
+        other = in_the_roles_of(ROOM, one, jnp.int32(outcome), jnp.int32(control))
         assert int(other.outcome) == outcome and other.context.sum() == one.context.sum()
         discs = [control, outcome, *({0, 1, 2} - {control, outcome}), 3]  # of which robot, object 1, ... play the roles
         turned = values.at[:, jnp.array(discs)].set(values[:, :4])
@@ -223,7 +228,7 @@ def population(*slots):
 )
 def test_a_model_is_tried_of_what_moved_by_way_of_what_is_controllable_and_in_no_circle(slots, expected):
     known = remembered()
-    found = candidates.possible(CONFIG, population(*slots), known, jnp.arange(96) < known.written)
+    found = possible(CONFIG, population(*slots), known, jnp.arange(96) < known.written)
     pairs = {(int(o), ACTION if c == NAMES else int(c)) for o, c in np.argwhere(found)}
     assert pairs == expected
 
@@ -248,16 +253,18 @@ def test_what_is_competent_and_explains_more_than_others_is_born_and_the_first_b
     )
     births = jnp.full((NAMES, NAMES + 1), NOBODY, jnp.int32)
     told = judged(own, {(4, 1): rival})
-    after, births = evolution.succeed(CONFIG, known, told, births, now=jnp.int32(250))
+    after, births = succeed(CONFIG, known, told, births, now=jnp.int32(250))
     assert bool(after.active[2]) == born and int(births[1, 0]) == (250 if born else NOBODY)
     assert not after.active[4]
     young = known.replace(age=known.age.at[4].set(0))
-    after, _ = evolution.succeed(CONFIG, young, told, births, now=jnp.int32(250))
+    after, _ = succeed(CONFIG, young, told, births, now=jnp.int32(250))
     assert not after.active[2] and after.active[4]
 
 
-@pytest.mark.parametrize(("own", "parent", "inputs", "better"), [(0.4, 0.5, 1, True), (0.48, 0.5, 1, False),
-                                                                (0.505, 0.5, 0, True), (0.6, 0.5, 0, False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("own", "parent", "inputs", "better"),
+    [(0.4, 0.5, 1, True), (0.48, 0.5, 1, False), (0.505, 0.5, 0, True), (0.6, 0.5, 0, False)],
+)
 def test_a_changed_copy_takes_the_place_of_its_parent_if_it_is_better_or_simpler(own, parent, inputs, better):
     known = population((1, ACTION, 0.5, True))
     context = known.models.context.at[0, :1].set(inputs == 0).at[4, 1 : 1 + inputs].set(True)
@@ -268,7 +275,7 @@ def test_a_changed_copy_takes_the_place_of_its_parent_if_it_is_better_or_simpler
         parent=known.parent.at[4].set(0),
     )
     births = jnp.full((NAMES, NAMES + 1), NOBODY, jnp.int32)
-    after, _ = evolution.succeed(CONFIG, known, judged(own, {}, parent), births, now=jnp.int32(250))
+    after, _ = succeed(CONFIG, known, judged(own, {}, parent), births, now=jnp.int32(250))
     np.testing.assert_array_equal(after.models.context[0], context[4 if better else 0])
     assert int(after.born[0]) == 100 and after.active.sum() == 1
 
@@ -276,11 +283,11 @@ def test_a_changed_copy_takes_the_place_of_its_parent_if_it_is_better_or_simpler
 def test_a_slot_of_no_use_is_switched_off_after_a_while_and_on_again():
     known, told = population((1, ACTION, 0.1, True)), judged(1.0, {})
     for count in range(1, CONFIG.patience + 1):
-        known = evolution.switch(CONFIG, known, told)
+        known = switch(CONFIG, known, told)
         assert bool(known.enabled[0]) == (count < CONFIG.patience)
     known = known.replace(competence=known.competence.at[0].set(0.8))
     for count in range(1, CONFIG.patience + 1):
-        known = evolution.switch(CONFIG, known, told.replace(own=told.own.at[0].set(0.2)))
+        known = switch(CONFIG, known, told.replace(own=told.own.at[0].set(0.2)))
         assert bool(known.enabled[0]) == (count == CONFIG.patience)
 
 
@@ -290,7 +297,7 @@ def test_what_is_imagined_follows_from_one_model_to_the_next_and_the_largest_cha
     contexts = jnp.array([[name == "object_1_from_robot" for name in ROOM.contexts]] * 7)
     known = known.replace(models=known.models._replace(context=contexts))
     values, actions = values_of(random.key(8), 1)[0], jnp.array([[0.5, -0.2], [1.0, 0.3]])
-    path = planner.imagine(ROOM, known, values, actions, slots=4)
+    path = imagine(ROOM, known, values, actions, slots=4)
     now = np.array(values)
     for t in range(2):
         seen = np.asarray(rooms.see(ROOM, jnp.asarray(now)))
@@ -321,7 +328,7 @@ def test_to_push_an_object_a_plan_first_goes_to_where_a_push_came_from():
 
     def first(now):
         aim = Aim(jnp.int32(1), now[1] - jnp.array([25.0, 0.0]))
-        return planner.levels(ROOM, known, past, now, aim, slots=4, key=random.key(0))
+        return levels(ROOM, known, past, now, aim, slots=4, key=random.key(0))
 
     found = first(now)
     assert found.used.tolist() == [True, False, False] and int(found.control[0]) == 0
