@@ -98,16 +98,15 @@ def reset(room: Room, *, key: Array) -> RoomState:
 
 def step(room: Room, state: RoomState, action: Float[Array, "2"]) -> RoomState:
     """The room after an action, each number of which is clipped to [-1, 1]."""
-    push, yielding = (jnp.asarray(_shares(room, heavy=heavy)) for heavy in (True, False))
-    move = jnp.clip(action, -1.0, 1.0) * STRIDE / SUBSTEPS
+    turns = [True] * ROUNDS + [False]
+    shares = jnp.array([_shares(room, heavy=heavy) for heavy in turns] * SUBSTEPS)
+    moves = jnp.array(([1.0] + [0.0] * ROUNDS) * SUBSTEPS)[:, None] * jnp.clip(action, -1.0, 1.0) * STRIDE / SUBSTEPS
 
-    def substep(_: Array, places: Array) -> Array:
-        places = places.at[0].add(move)
-        for _round in range(ROUNDS):
-            places = _clear(room, _apart(places, push))
-        return _clear(room, _apart(places, yielding))
+    def relax(places: Array, turn: tuple[Array, Array]) -> tuple[Array, None]:
+        move, share = turn
+        return _clear(room, _apart(places.at[0].add(move), share)), None
 
-    return state.replace(places=jax.lax.fori_loop(0, SUBSTEPS, substep, state.places))
+    return state.replace(places=jax.lax.scan(relax, state.places, (moves, shares))[0])
 
 
 def observe(state: RoomState) -> Float[Array, "B 2"]:

@@ -108,11 +108,13 @@ def imagine(
 
     def step(values: Array, action: Array) -> tuple[Array, Array]:
         hidden = (rooms.see(room, values).ravel() @ flat).reshape(weights.bias.shape) + weights.bias
-        change = jnp.zeros((names + 1, 2)).at[models.ACTION].set(action)
-        for _ in range(DEPTH):
+
+        def follow(_: Array, change: Array) -> Array:
             effects = jax.vmap(models.effect)(weights, hidden, change[control])
             largest = jnp.argmax(jnp.where(of, jnp.square(effects).sum(axis=-1), -1.0), axis=1)
-            change = change.at[:-1].set(jnp.where(of.any(axis=1)[:, None], effects[largest], 0.0))
+            return change.at[:-1].set(jnp.where(of.any(axis=1)[:, None], effects[largest], 0.0))
+
+        change = jax.lax.fori_loop(0, DEPTH, follow, jnp.zeros((names + 1, 2)).at[models.ACTION].set(action))
         values = jnp.clip(values + change[:-1] * room.units[:, None], room.lower, room.upper)
         return values, values
 
