@@ -100,9 +100,9 @@ def claims(found: Mapping[str, Any]) -> list[Claim]:
         times = [first.get(name, np.inf) for name in names[:count]]
         return float(np.isfinite(times).all() and bool((np.diff(times) > 0).all()))
 
-    for count, text in ((2, "first the robot, then an object"), (3, "and then an object by an object")):
+    for row, count, text in (("ours", 2, "robot, object"), ("k", 3, "robot, object, object by object")):
         share = np.array([in_order(first, count) for first in order])
-        made.append(mean("k", f"share of learners: {text}", share, ">= .8", lambda x: x >= 0.8))
+        made.append(mean(row, f"share of learners with births in order: {text}", share, ">= .8", lambda x: x >= 0.8))
     practice = np.asarray(room["practice"]["robot"])
     made.append(less("ours", "share of the robot in practice, last fifth - first", practice[-1], practice[0]))
     tests = {name: {key: np.asarray(value[-1]) for key, value in one["tests"].items()} for name, one in found.items()}

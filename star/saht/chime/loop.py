@@ -69,7 +69,7 @@ def init(config: ChimeConfig, room: Room, *, key: Array) -> State:
         memory=memories.empty(config.memory, names, inputs),
         population=population,
         births=births,
-        choice=selection.init(config.choice, space, [1.0] * len(WAYS)),
+        choice=selection.init(config.choice.selection, space, [1.0] * len(WAYS)),
         epoch=jnp.zeros((), jnp.int32),
         key=key,
     )
@@ -148,7 +148,7 @@ def block(config: ChimeConfig, room: Room, state: State, *, key: Array) -> tuple
     reset_key, dice_key, act_key = jax.random.split(key, 3)
     dice = jax.random.uniform(dice_key, (2,))
     enabled = state.population.enabled[: config.models]
-    chances = selection.probabilities(config.choice, state.choice, admissible=enabled)
+    chances = selection.probabilities(config.choice.selection, state.choice, admissible=enabled)
     slot, way = jnp.divmod(drawn(chances.ravel(), dice[0]), len(WAYS))
     written = jnp.minimum(state.memory.written, len(state.memory.values))
     seen = (dice[1] * written).astype(jnp.int32)
@@ -187,6 +187,6 @@ def told(
     same = ((before.born == after.born) & before.active)[:slots]
     gained = jnp.where(same, (after.competence - before.competence)[:slots], 0.0) / jnp.maximum(spent.sum(axis=1), 1.0)
     slot, way = (each.ravel() for each in jnp.indices(spent.shape))
-    choice = selection.credit(config.choice, choice, slot, way, gained[slot], spent.ravel())
+    choice = selection.credit(config.choice.selection, choice, slot, way, gained[slot], spent.ravel())
     known = same[:, None]
     return choice.replace(gains=jnp.where(known, choice.gains, 0.0), doubt=jnp.where(known, choice.doubt, 1.0))

@@ -24,22 +24,24 @@ class RoomConfig(Section):
         return 1 + self.movable + self.movable * (self.movable - 1) // 2
 
 
-class TaskSelectionConfig(SelectionConfig):
-    """The choice of a task and of how to practise it; an episode is a block, and goals are chosen elsewhere."""
+class ChoiceConfig(Section):
+    """How a task, and a way to practise it, are chosen by progress."""
 
-    window: Annotated[int, Field(ge=4, le=2**20)] = setting(
-        4, "So many episodes of each region are remembered.", unit="episodes"
-    )
-    per_block: Positive = setting(1, "Each region remembers at most so many episodes of one block.", unit="episodes")
-    best: float = setting(0.0, "This share of choices has its goal near a region's best point.", unit="", ge=0, le=1)
     random: float = setting(0.1, "This share of choices is drawn evenly.", unit="", ge=0, le=1)
+    sharpness: float = setting(2.0, "Choices are drawn in proportion to interest to this power.", unit="", gt=0)
     optimism: float = setting(
         0.003, "The root of a doubt of 1 is worth at most this.", unit="competence per block", ge=0
     )
-    sharpness: float = setting(2.0, "Choices are drawn in proportion to interest to this power.", unit="", gt=0)
     drift: float = setting(
         0.005, "The doubt about what a strategy adds begins with 1 and grows by this in a block.", unit="", gt=0
     )
+
+    @property
+    def selection(self) -> SelectionConfig:
+        """The same for `star.sgim.selection`, which remembers no goals here."""
+        usual = {name: getattr(SelectionConfig(), name) for name in SelectionConfig.model_fields}
+        own = {name: getattr(self, name) for name in ChoiceConfig.model_fields}
+        return SelectionConfig.model_construct(**usual | own | {"best": 0.0, "window": 4, "per_block": 1})
 
 
 class ChimeConfig(Section):
@@ -82,7 +84,7 @@ class ChimeConfig(Section):
         2, "Models evolve after so many episodes: an epoch.", unit="episodes"
     )
     memory: Annotated[int, Field(gt=0, le=2**24)] = setting(5000, "So many actions are remembered.", unit="actions")
-    choice: TaskSelectionConfig = TaskSelectionConfig()
+    choice: ChoiceConfig = ChoiceConfig()
 
     @property
     def epoch(self) -> int:
