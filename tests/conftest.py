@@ -166,6 +166,8 @@ def compiled(config):
     """The structure of `config`, whatever the loop around its program does; None if it depends on files."""
     if config.experiment == "saht":
         return None if any(one.source != "world" for one in config.saht.teachers) else programs.structure(config)
+    if config.experiment == "chime":
+        return programs.structure(config)
     if config.experiment != "star" or ":" in config.env.name:
         return None
     learners = any(":" in level.learner for _, level, _ in config.learners())

@@ -22,6 +22,7 @@ from star.agent import demonstrations, exam_results, exam_tables, exams, films
 from star.agent.sections import Config
 from star.cli import main
 from star.config.loading import fields, load, parse
+from star.saht.chime.sections import Config as ChimeConfig
 from star.saht.sections import Config as SahtConfig
 from star.sweeps import work
 from star.training import program as programs
@@ -96,6 +97,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(films, "render", lambda config, show, **_: "")
     for name in ("render", "record"):
         monkeypatch.setattr(f"star.saht.commands.{name}", lambda options, overrides: 0)
+        monkeypatch.setattr(f"star.saht.chime.commands.{name}", lambda options, overrides: 0)
     monkeypatch.setattr("star.report.evaluations.evaluate", lambda config, run_dir, **_: [])
     monkeypatch.setattr("star.report.page.write", lambda runs, out, **_: "")
     monkeypatch.setattr(work, "run", lambda found, out, **_: work.Summary([], True, {"trial": 0}))
@@ -108,7 +110,7 @@ def folder(tmp_path, monkeypatch):
 def test_every_command_line_of_the_pages_is_accepted(words, folder):
     for run in {run for word in words for run in re.findall(r"\bruns/[\w-]+", word)}:
         (folder / run).mkdir(parents=True)
-        config = SahtConfig() if run.startswith("runs/saht") else Config()
+        config = {"saht": SahtConfig, "chime": ChimeConfig}.get(re.split("[/-]", run)[1], Config)()
         (folder / run / "config.yaml").write_text(config.to_yaml())
     assert main(words[1:]) == 0
 

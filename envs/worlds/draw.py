@@ -33,7 +33,7 @@ def still(
     sole(trace.outcomes.reached, world)
     index = None if task is None else world.index(task)
     path, found = jax.tree.map(np.asarray, (trace.path, trace.outcomes))
-    figure = _figure(height, 2.4 if world.sketch else len(world.tasks))
+    figure = figure_of(height, 2.4 if world.sketch else len(world.tasks))
     marked = None if index is None or goal is None else np.asarray(goal)
     if world.sketch is None:
         _sketch_outcomes(figure, world, found, index, marked)
@@ -43,7 +43,7 @@ def still(
         apart = np.linalg.norm(found.value[index] - marked)
         said = f"ends {apart:.3f} from the goal" if found.reached[index] else "not reached"
         figure.suptitle(f"{world.names[index]}: {said}", x=0.01, ha="left", size=10, color=INK)
-    return _pixels(figure)
+    return pixels(figure)
 
 
 def film(
@@ -96,7 +96,8 @@ def _sketch_outcomes(figure: Any, world: World, found: Any, task: int | None, go
             star(axes, *goal[:2])
 
 
-def _figure(height: int, aspect: float) -> Any:
+def figure_of(height: int, aspect: float) -> Any:
+    """A Matplotlib figure so many pixels high, and `aspect` times as wide."""
     from matplotlib.figure import Figure
 
     size = np.array([round(height * aspect / 2) * 2, height])
@@ -106,7 +107,8 @@ def _figure(height: int, aspect: float) -> Any:
     return figure
 
 
-def _pixels(figure: Any) -> np.ndarray:
+def pixels(figure: Any) -> np.ndarray:
+    """What is drawn on it: uint8 [height, width, 3]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(figure)

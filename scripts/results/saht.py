@@ -164,19 +164,22 @@ def _share(algorithm: Mapping[str, Any], task: int, begins: Sequence[str]) -> np
     return chosen[:, mine].sum(axis=1) / np.maximum(chosen.sum(axis=1), 1)
 
 
-def _mean(row: str, text: str, sample: np.ndarray, wanted: str, passes: Callable[[float], bool]) -> Claim:
+def mean(row: str, text: str, sample: np.ndarray, wanted: str, passes: Callable[[float], bool]) -> Claim:
+    """A claim about the mean of a sample."""
     value, low, high = stratified([sample], lambda x: x.mean())
     return Claim(row, text, float(value), float(low), float(high), wanted, passes(float(value)))
 
 
-def _ratio(
+def ratio(
     row: str, text: str, one: np.ndarray, other: np.ndarray, wanted: str, passes: Callable[[float], bool]
 ) -> Claim:
+    """A claim about the ratio of two means."""
     value, low, high = stratified([one, other], lambda x, y: x.mean() / y.mean())
     return Claim(row, text, float(value), float(low), float(high), wanted, passes(float(value)))
 
 
-def _less(row: str, text: str, one: np.ndarray, other: np.ndarray) -> Claim:
+def less(row: str, text: str, one: np.ndarray, other: np.ndarray) -> Claim:
+    """A claim that the mean of `one` is less than that of `other`."""
     value, low, high = stratified([one, other], lambda x, y: x.mean() - y.mean())
     return Claim(row, text, float(value), float(low), float(high), "below 0, interval too", bool(high < 0))
 
@@ -189,35 +192,35 @@ def claims_of_pen(found: Mapping[str, Any]) -> list[Claim]:
     if {"im_pb", "sagg_riac"} <= found.keys():
         im, sagg = found["im_pb"], found["sagg_riac"]
         claims += [
-            _mean("e", "IM-PB: mean error", _final(im), "<= .17", lambda x: x <= 0.17),
-            _ratio(
+            mean("e", "IM-PB: mean error", _final(im), "<= .17", lambda x: x <= 0.17),
+            ratio(
                 "e", "IM-PB / SAGG-RIAC: character", _final(im, "character"), _final(sagg, "character"),
                 "<= .5", lambda x: x <= 0.5,
             ),
             *(
-                _less("e", f"IM-PB - SAGG-RIAC: {task}", _final(im, task), _final(sagg, task))
+                less("e", f"IM-PB - SAGG-RIAC: {task}", _final(im, task), _final(sagg, task))
                 for task in ("line", "pen")
             ),
         ]  # fmt: skip
         played = np.asarray(im["played"], float)
         length = played @ np.arange(1, played.shape[-1] + 1) / np.maximum(played.sum(axis=-1), 1)
         claims.append(
-            _less("e", "IM-PB: primitives for the tip - for the character", length[:, tip], length[:, character])
+            less("e", "IM-PB: primitives for the tip - for the character", length[:, tip], length[:, character])
         )
     if {"sgim_pb", "sgim_acts"} <= found.keys():
         pb, acts = found["sgim_pb"], found["sgim_acts"]
         claims += [
             *(
-                _less("f", f"SGIM-PB - SGIM-ACTS: {task}", _final(pb, task), _final(acts, task))
+                less("f", f"SGIM-PB - SGIM-ACTS: {task}", _final(pb, task), _final(acts, task))
                 for task in ("line", "character")
             ),
-            _mean("f", "SGIM-PB: mean error", _final(pb), "<= .11", lambda x: x <= 0.11),
+            mean("f", "SGIM-PB: mean error", _final(pb), "<= .11", lambda x: x <= 0.11),
         ]
     if "sgim_pb" in found:
         pb = found["sgim_pb"]
         procedures = ("procedures", "procedure_")
         claims.append(
-            _mean(
+            mean(
                 "g",
                 "SGIM-PB: share of procedures for the character",
                 _share(pb, character, procedures),
@@ -227,26 +230,26 @@ def claims_of_pen(found: Mapping[str, Any]) -> list[Claim]:
         )
         for task in ("tip", "joystick_1", "joystick_2"):
             share = _share(pb, tasks.index(task), procedures)
-            claims.append(_mean("g", f"SGIM-PB: share of procedures for {task}", share, "<= .12", lambda x: x <= 0.12))
+            claims.append(mean("g", f"SGIM-PB: share of procedures for {task}", share, "<= .12", lambda x: x <= 0.12))
         shares = np.asarray(pb["tasks"]["tip"])
         claims.append(
-            _ratio("h", "SGIM-PB: share of the tip, first quarter / last", _quarter(shares), _quarter(shares[::-1]),
+            ratio("h", "SGIM-PB: share of the tip, first quarter / last", _quarter(shares), _quarter(shares[::-1]),
                    ">= 1.2", lambda x: x >= 1.2)
         )  # fmt: skip
         asked = np.asarray(pb["requests"])
         claims += [
-            _ratio("i", "SGIM-PB: requests, first tenth / last", asked[0], asked[-1], ">= 1.5", lambda x: x >= 1.5),
-            _mean("j", "SGIM-PB: requests, share of all blocks", asked.mean(axis=0), "<= .35", lambda x: x <= 0.35),
+            ratio("i", "SGIM-PB: requests, first tenth / last", asked[0], asked[-1], ">= 1.5", lambda x: x >= 1.5),
+            mean("j", "SGIM-PB: requests, share of all blocks", asked.mean(axis=0), "<= .35", lambda x: x <= 0.35),
         ]
     if {"sgim_pb", "sgim_pb_even"} <= found.keys():
         pb, even = found["sgim_pb"], found["sgim_pb_even"]
         for at, step in enumerate(pb["steps"]):
             if step >= 10_000:
                 claims.append(
-                    _less("even", f"SGIM-PB - even choice at {step:,}", _final(pb, at=at), _final(even, at=at))
+                    less("even", f"SGIM-PB - even choice at {step:,}", _final(pb, at=at), _final(even, at=at))
                 )
         claims.append(
-            _ratio("even", "SGIM-PB / even choice at the end", _final(pb), _final(even), "<= .88", lambda x: x <= 0.88)
+            ratio("even", "SGIM-PB / even choice at the end", _final(pb), _final(even), "<= .88", lambda x: x <= 0.88)
         )
     return claims
 
@@ -264,24 +267,24 @@ def claims_of_throw(found: Mapping[str, Any]) -> list[Claim]:
     acts = found["sgim_acts"]
     for name in ("random", "sagg_riac", "mimicry", "emulation"):
         if name in found:
-            claims.append(_less("c", f"SGIM-ACTS - {name}: mean error", _final(acts), _final(found[name])))
+            claims.append(less("c", f"SGIM-ACTS - {name}: mean error", _final(acts), _final(found[name])))
     for number, task in enumerate(("thrown", "placed")):
         chosen = np.asarray(acts["chosen"], float)[:, number]
         asked = np.array([way.startswith(("action_", "outcome_")) for way in acts["ways"]])
         own = np.array([way in (f"action_{task}", f"outcome_{task}") for way in acts["ways"]])
         share = chosen[:, own].sum(axis=1) / np.maximum(chosen[:, asked].sum(axis=1), 1)
         claims.append(
-            _mean("c", f"SGIM-ACTS: own teachers among those asked for {task}", share, ">= .65", lambda x: x >= 0.65)
+            mean("c", f"SGIM-ACTS: own teachers among those asked for {task}", share, ">= .65", lambda x: x >= 0.65)
         )
     for flaw in ("repetitive", "other_body"):
         if f"sgim_acts_{flaw}" in found:
             claims.append(
-                _ratio("d", f"SGIM-ACTS: {flaw} / good teachers", _final(found[f"sgim_acts_{flaw}"]), _final(acts),
+                ratio("d", f"SGIM-ACTS: {flaw} / good teachers", _final(found[f"sgim_acts_{flaw}"]), _final(acts),
                        "<= 1.1", lambda x: x <= 1.1)
             )  # fmt: skip
         if {f"even_{flaw}", "sgim_acts_even"} <= found.keys():
             claims.append(
-                _ratio("d", f"even choice: {flaw} / good teachers", _final(found[f"even_{flaw}"]),
+                ratio("d", f"even choice: {flaw} / good teachers", _final(found[f"even_{flaw}"]),
                        _final(found["sgim_acts_even"]), ">= 1.2", lambda x: x >= 1.2)
             )  # fmt: skip
     return claims

@@ -513,7 +513,7 @@ function throughput() {
 const LEVELS = [
   ["Controller", /^controller\//], ["Tutor", /^tutor\//], ["Commander", /^commander\//],
   ["Abstraction and refinement", /^(abstraction|refinement)\//], ["Forward model", /^forward_model\//],
-  ["Adjacency", /^adjacency\//], ["SGIM", /^sgim\//], ["Practice", /^saht\//], ["Test episodes", /^eval\//],
+  ["Adjacency", /^adjacency\//], ["SGIM", /^sgim\//], ["Practice", /^(saht|chime)\//], ["Test episodes", /^eval\//],
   ["Training episodes", /^train\//], ["Simulator", /^env\//],
 ];
 

@@ -24,6 +24,7 @@ OURS: Mapping[str, str] = {
     "star": "star.agent.kind:STAR",
     "saht": "star.saht.kind:SAHT",
     "tutoring": "star.tutoring.kind:TUTORING",
+    "chime": "star.saht.chime.kind:CHIME",
 }
 """The experiments of this package, imported when they are first needed."""
 

@@ -93,7 +93,7 @@ class TrainerConfig(Section):
         return value
 
 
-EXPERIMENTS = "star, saht, tutoring, or module:name of your own"
+EXPERIMENTS = "star, saht, tutoring, chime, or module:name of your own"
 
 
 class RunConfig(Section):

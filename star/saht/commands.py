@@ -34,16 +34,8 @@ def envs() -> list[str]:
 
 def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     """Draw how a learner reaches a goal of the evaluation, or what the teacher of a world shows for it."""
-    for flag, usual in _OF_EPISODES.items():
-        if getattr(options, flag) != usual:
-            raise ConfigError(
-                f"--{flag}: is for tasks of experiment star; allowed here: --episode, --every, --fps, --height"
-            )
-    video.check(options.out, force=options.force)
+    check_flags(options)
     if options.run is None:
-        for flag in ("checkpoint", "seed"):
-            if getattr(options, flag) is not None:
-                raise ConfigError(f"--{flag}: needs --run")
         world = Saht(parse({"experiment": "saht"}, overrides | {"world.name": options.task})).world
         task, how = _showable(world), "its teacher"
         goal = _goal(world, task, options.episode)
@@ -59,6 +51,19 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     written = video.write(options.out, _pictures(options, world, trace, int(length), task, goal), fps=options.fps)
     print(f"{options.out}: {written} picture{'s' * (written > 1)}; {world.names[task]} by {how}")
     return 0
+
+
+def check_flags(options: argparse.Namespace) -> None:
+    """Refuse what `star render` takes for tasks of STAR alone, or of runs, and a file that cannot be written."""
+    for flag, usual in _OF_EPISODES.items():
+        if getattr(options, flag) != usual:
+            raise ConfigError(
+                f"--{flag}: is for tasks of experiment star; allowed here: --episode, --every, --fps, --height"
+            )
+    video.check(options.out, force=options.force)
+    for flag in ("checkpoint", "seed"):
+        if options.run is None and getattr(options, flag) is not None:
+            raise ConfigError(f"--{flag}: needs --run")
 
 
 def _pictures(

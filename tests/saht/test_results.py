@@ -71,7 +71,7 @@ def test_claims_hold_or_fail_as_the_numbers_say(monkeypatch):
 def test_an_interval_that_reaches_zero_is_no_difference():
     script = load("results/saht")
     one, other = np.array([0.1, 0.3, 0.2, 0.2]), np.array([0.3, 0.2, 0.2, 0.2])
-    claim = script._less("f", "", one, other)
+    claim = script.less("f", "", one, other)
     assert claim.value < 0 < claim.high and not claim.holds
 
 

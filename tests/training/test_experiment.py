@@ -209,7 +209,7 @@ def test_what_was_not_measured_is_worst(better):
         (["--learning.step_size", "2"], "learning.step_size: 2 is not allowed: should be at most 1"),
         (["--learning.stepsize", "1"], "learning.stepsize: unknown key (did you mean learning.step_size?)"),
         (["--tutor.period", "3"], "tutor: unknown key, it is one of experiment star (allowed: experiment, learning, "),
-        (["--experiment", "sta"], "experiment: 'sta' is not allowed: should be star, saht, tutoring or module"),
+        (["--experiment", "sta"], "experiment: 'sta' is not allowed: should be star, saht, tutoring, chime or module"),
         (["--experiment", "bandit:Bandit"], "experiment: bandit:Bandit: is a class; allowed: a star.config.kinds.Kind"),
         (["--experiment", "bandit:ARMS"], "experiment: bandit:ARMS: bandit holds no ARMS; allowed: a star.config.kin"),
         (["--experiment", "closer:PARTS"], "experiment: closer:PARTS: has no epoch; all have steps_per_epoch, init, "),
