@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-GRAVITY, DRAG = 9.81, 0.3  # m/s^2, 1/s
+GRAVITY, DRAG = 9.81, 1.0  # m/s^2, 1/s
 LENGTH = 1.0  # m
 SHARE = 1 / 6  # mass of the middle over that of the float
 DT = 0.004  # s: with steps of .001 s a float comes down within 1.5 cm, in nine of ten movements of the world fishing

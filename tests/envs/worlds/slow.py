@@ -197,7 +197,7 @@ def fishing(primitives):
         anchor = np.array([tip(primitive, step * dt) for primitive in primitives])
         now = [anchor]
         falls = [v + dt * np.array([0, 0, -9.81]) for v in speeds]
-        now += [x + dt * v * (1 - 0.3 * dt) for x, v in zip(masses, falls, strict=True)]
+        now += [x + dt * v * (1 - 1.0 * dt) for x, v in zip(masses, falls, strict=True)]
         ways = []
         for i in range(2):
             last, free = before[i + 1] - before[i], now[i + 1] - now[i]
