@@ -33,7 +33,7 @@ import numpy as np
 from envs import worlds
 from envs.worlds import dmp, fishing, pen, rope, table, throw
 
-STEP = 2e-4  # s
+STEP = 2e-4  # s, about
 STEPS = 1000  # in which a ball is thrown
 STIFF, DAMP, ARMATURE = 1e6, 2e3, 1.0  # of motors: N m/rad, N m s/rad, kg m^2
 SHARE = 0.95
@@ -71,7 +71,8 @@ def follow(
     simulator: mujoco.MjModel, data: mujoco.MjData, angles: np.ndarray, dt: float
 ) -> Iterator[tuple[int, np.ndarray]]:
     """Lead the motors along angles [n + 1, joints], `dt` apart; after each of n times its number and the tip."""
-    within = round(dt / simulator.opt.timestep)
+    within = max(1, round(dt / STEP))
+    simulator.opt.timestep = dt / within
     for number, (before, after) in enumerate(zip(angles[:-1], angles[1:], strict=True)):
         ahead = (after - before) / dt * DAMP / STIFF  # the motors brake all speed; this makes up for it
         for part in range(within):
@@ -152,7 +153,6 @@ def check_throw(number: int) -> dict[str, list[float]]:
         dt = max(float(move.duration * move.share), 0.01) / STEPS
         swing = np.asarray(swings(move, float(move.share) * np.arange(STEPS + 1) / STEPS), float)
         angles = np.column_stack([np.full(STEPS + 1, float(move.yaw)), swing])
-        simulator.opt.timestep = dt / 5
         data = start(simulator, angles[0])
         for _, place in follow(simulator, data, angles, dt):
             tip = place

@@ -20,7 +20,7 @@ class WorldConfig(Section):
     noise: float = setting(
         0.0, "All numbers of executed primitives get noise of this standard deviation.", unit="", ge=0, le=1
     )
-    options: dict[str, Any] = setting({}, "These options are passed to your own world.", allowed="options of the world")
+    options: dict[str, Any] = setting({}, "These options are passed to the world.", allowed="options of the world")
 
     _import_nothing_that_only_a_file_names = field_validator("name")(module_name)
     _refuse_what_no_option_holds = field_validator("options")(simple)

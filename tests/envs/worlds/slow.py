@@ -178,8 +178,8 @@ def six_joints(angles, shoulder, links, hand):
 
 
 def fishing(primitives):
-    """Where each float meets the water (x, y over 2.2 m), or NaN. In steps of 2 ms; tensions one after the other."""
-    primitives, dt = np.asarray(primitives, float), 2e-3
+    """Where each float meets the water (x, y over 2.2 m), or NaN. In steps of 1.25 ms; tensions one after the other."""
+    primitives, dt = np.asarray(primitives, float), 1.25e-3
     n, limits = len(primitives), np.array([0.96, 0.72, 0.72, 0.96, 0.72, 0.96])
     rest, inverse = np.array([0.0, -0.3, 0.8, 0.0, 0.2, 0.0]), [0.0, 1.0, 1 / 6]
 
@@ -192,7 +192,7 @@ def fishing(primitives):
     anchor = np.array([tip(primitive, 0.0) for primitive in primitives])
     masses, speeds = [anchor - [0, 0, 0.5], anchor - [0, 0, 1.0]], [np.zeros((n, 3))] * 2
     landed, length = np.full((n, 2), np.nan), lambda way: np.linalg.norm(way, axis=1)[:, None]
-    for step in range(1, 1001):
+    for step in range(1, 1601):
         before, old = [anchor, *masses], masses
         anchor = np.array([tip(primitive, step * dt) for primitive in primitives])
         now = [anchor]

@@ -8,7 +8,7 @@ from tests.envs.worlds import slow
 from tests.scripts import load
 
 WORLD = worlds.make("fishing")
-SHARE = 0.2185  # of 400,000 random movements
+SHARE = 0.227  # of 400,000 random movements
 N = 600  # one size of batch: it is compiled once
 
 
@@ -22,11 +22,11 @@ def movements():
 def test_it_agrees_with_a_slow_simulation_in_steps_half_as_long(movements):
     sequences, found = movements
     reached = found.outcomes.reached[:, 0]
-    some = np.concatenate([np.flatnonzero(reached)[:6], np.flatnonzero(~reached)[:2]])
+    some = np.concatenate([np.flatnonzero(reached)[:5], np.flatnonzero(~reached)[:1]])
     expected = slow.fishing(sequences[some, 0])
-    assert np.isnan(expected[6:]).all()
-    apart = np.linalg.norm(found.outcomes.value[some[:6], 0, :2] - expected[:6], axis=1) * fishing.FIELD
-    assert np.median(apart) < 0.02 and (apart < 0.05).sum() >= 5  # where a float grazes the water, little decides
+    assert np.isnan(expected[5:]).all()
+    apart = np.linalg.norm(found.outcomes.value[some[:5], 0, :2] - expected[:5], axis=1) * fishing.FIELD
+    assert np.median(apart) < 0.02 and (apart < 0.05).sum() >= 4  # where a float grazes the water, little decides
 
 
 def test_the_line_is_never_longer_than_it_is_and_ends_at_the_tip_of_the_rod(movements):
@@ -43,7 +43,7 @@ def test_random_movements_reach_the_water_as_often_as_the_page_says_and_where_th
     assert (np.abs(found.value) <= 1).all() and not found.value[~found.reached].any()
     goals = np.asarray(WORLD.benchmark("float"))[:, :2]
     near = np.abs(found.value[found.reached][:, None, :2] - goals).max(axis=-1).min(axis=1) <= 1.001 / fishing.CELLS
-    assert len(goals) == 170 and near.mean() > 0.99
+    assert len(goals) == 160 and near.mean() > 0.99
 
 
 def test_a_float_in_the_water_stays_where_it_is(movements):
@@ -63,7 +63,7 @@ def test_the_teachers_casts_are_alike_but_for_their_size_and_come_down_near_the_
     filled = [np.resize(np.asarray(one), (N, *one.shape[1:])) for one in (sequences, lengths)]
     found = jax.device_get(WORLD.trace(*filled)).outcomes
     error = np.linalg.norm((found.value[: len(goals), 0] - goals)[:, :2], axis=1)
-    assert found.reached.all() and np.median(error) < 0.2 and error.min() < 0.02
+    assert found.reached.all() and np.median(error) < 0.25 and error.min() < 0.02
 
 
 def test_a_scale_enlarges_the_bounds_of_goals_and_nothing_else():
