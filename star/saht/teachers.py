@@ -36,7 +36,7 @@ from star.sgim import teachers as sgim_teachers
 
 FORMAT = 1
 SKILFUL = 0.05  # a teacher shows goals that he reaches up to this share of the diagonal of the evaluation's goals
-TRIES, ROUNDS = 64, 16  # goals that a teacher tries at once for each that he shows, and how often at most
+TRIES, ROUNDS = 64, 64  # goals that a teacher tries at once for each that he shows, and how often at most
 _NAMES = ("format", "world", "tasks", "sequences", "lengths", "outcomes")
 _PROCEDURES = ("pairs", "subgoals")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from envs import worlds
-from star.saht import cba, dagger, imitators, loop, memory, proposals
+from star.saht import cba, dagger, imitators, loop, memory, proposals, teachers
 from star.saht.memory import FAR, scale_of
 from star.saht.proposals import Dice, Order, Setting
 from star.saht.teachers import SKILFUL
@@ -121,6 +121,14 @@ def test_confidence_agrees_with_a_slow_computation(n):
     assert [mine for mine, _ in answers] == [slow for _, slow in answers]
     if n == 200:
         assert len({mine for mine, _ in answers}) == 2
+
+
+def test_a_teacher_shows_what_he_can_where_most_goals_are_out_of_reach():
+    far = dataclasses.replace(TASKS[0], lower=(-12.0, -12.0), upper=(12.0, 12.0))
+    world = dataclasses.replace(WORLD, tasks=(far,), simulate=lambda s, n: (worlds.outcomes((2 * s[0], True)), s))
+    demos = teachers.demonstrated(world, 0, 5, scale_of(world))  # the others of 320 goals are farther than 2
+    assert len(demos.lengths) == 5 and np.abs(demos.outcomes).max() <= 2
+    np.testing.assert_allclose(demos.outcomes[:, :2], 2 * demos.sequences[:, 0], atol=1e-6)
 
 
 def test_a_world_in_which_nobody_shows_a_task_has_no_such_learners():
