@@ -73,7 +73,7 @@ def test_a_scale_enlarges_the_bounds_of_goals_and_nothing_else():
 
 
 def test_the_check_finds_that_mujoco_does_the_same(movements):
-    """Two casts that land, and the arm of the world `table`."""
+    """Two casts that land."""
     check = load("checks/worlds")
     sequences, found = movements
     kept = np.flatnonzero(found.outcomes.reached[:, 0])[:2]

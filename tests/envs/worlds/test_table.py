@@ -6,6 +6,7 @@ from envs import worlds
 from envs.worlds import table
 from envs.worlds.table import Hand, Tasks
 from tests.envs.worlds import slow
+from tests.scripts import load
 
 WORLD = worlds.make("table")
 SHARES = (0.142, 0.0, 0.0, 0.0, 0.0058, 0.0)  # of random single primitives, by task
@@ -93,3 +94,8 @@ def test_another_body_reaches_less_with_other_movements():
     assert np.abs(found.value[:, Tasks.RHYTHM] - goals).max() < 2e-3
     assert np.ptp(goals[:, 0]) < np.ptp(WORLD.benchmark(Tasks.RHYTHM)[:, 0])
     assert not traced(sequences, lengths).outcomes.reached[:, Tasks.RHYTHM].all()
+
+
+def test_the_check_finds_that_mujoco_does_the_same():
+    seen = load("checks/worlds").check_table(1)
+    assert max(seen["tip"]) < 0.02 and len(seen["tip"]) == 5 and max(seen["carried"]) < 0.1
