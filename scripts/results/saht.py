@@ -37,7 +37,7 @@ from scripts.pages import charts
 from star.config.loading import load_run
 from star.report.statistics import over_seeds, stratified
 from star.saht.experiment import Saht
-from star.saht.figures import colour, plain_ticks
+from star.saht.figures import TASKS, colour, plain_ticks
 from star.training.journal import Journal, by_step
 
 ROOT = Path(__file__).parents[2]
@@ -443,7 +443,7 @@ def draw(found: Mapping[str, Any]) -> Figure:
     for axes, task in zip(panels, tasks, strict=False):
         for number, (name, one) in enumerate(found.items()):
             mean = [np.mean(now) for now in one["errors"][task]]
-            style = "--" if "even" in name else "-"
+            style = "--" if "even" in name else ":" if number >= len(TASKS) else "-"
             axes.plot(np.asarray(one["steps"]) / 1000, mean, style, color=colour(number), lw=1.4, label=name)
         axes.set(title="mean of the tasks" if task == "mean" else task.replace("_", " "), yscale="log")
         plain_ticks(axes)
