@@ -21,8 +21,12 @@ from envs.worlds.world import Decomposition, Outcomes, Task, Trace, World, outco
 
 __all__ = ["Decomposition", "Outcomes", "Task", "Trace", "World", "make", "names", "outcomes"]
 
-_HOMES = {name: f"envs.worlds.{name}" for name in ("pen", "throw")}
+_HOMES = {name: f"envs.worlds.{name}" for name in ("pen", "throw", "fishing", "table")}
 _NOISE = {"noise": number(0.0, 0.0, 1.0)}
+_OPTIONS = {
+    "fishing": {"scale": number(1.0, 1.0, 100.0)},
+    "table": {"links": number(1.0, 0.8, 1.0), "limits": number(1.0, 0.5, 1.0)},
+}
 
 
 def names() -> tuple[str, ...]:
@@ -37,7 +41,7 @@ def make(name: str, *, noise: float = 0.0, **options: Any) -> World:
       name: one of `names()`, or `module:name`, a function of your own that makes a `World`. Its module is used only if
         `envs.common.plugins` is told to trust it.
       noise: standard deviation of what is added to every number of a primitive when it is executed.
-      **options: those of your own function; the worlds of this package have none.
+      **options: those of your own function, or of a world that has some: docs/worlds.md.
 
     Raises:
       EnvError: in one line, if a name, an option or a value is wrong.
@@ -52,8 +56,8 @@ def make(name: str, *, noise: float = 0.0, **options: Any) -> World:
         except EnvError as error:
             raise EnvError(f"{name}: {error}") from error
     elif name in _HOMES:
-        resolve(name, _NOISE, options | {"noise": noise})
-        world = importlib.import_module(_HOMES[name]).make()
+        own = resolve(name, _NOISE | _OPTIONS.get(name, {}), options | {"noise": noise})
+        world = importlib.import_module(_HOMES[name]).make(**{key: float(own[key]) for key in _OPTIONS.get(name, {})})
     else:
         raise EnvError(f"world {shown(name)} is unknown; {known(name, _HOMES)}, or module:name of your own")
     return dataclasses.replace(world, noise=float(noise))

@@ -1,4 +1,4 @@
-"""Planar arms of revolute joints: where they are, and which posture reaches a point."""
+"""Arms of revolute joints: where they are, and which posture reaches a point. Planar ones, and one of six joints."""
 
 from __future__ import annotations
 
@@ -54,3 +54,32 @@ def _opposite(first: float, second: Array | float, distance: Array) -> Array:
     """The angle in [0, pi] by which two links turn at their joint, where their ends are so far apart (cosine rule)."""
     cosine = (distance**2 - first**2 - second**2) / (2 * first * second)
     return jnp.arccos(jnp.clip(cosine, -1.0, 1.0))
+
+
+def spatial(
+    angles: Float[Array, "6 *batch"], links: Sequence[float], hand: Sequence[float]
+) -> list[tuple[Array, Array, Array]]:
+    """(x, y, z) of the elbow, the wrist and the tip of an arm of six joints, from its shoulder, in the unit of `links`.
+
+    The joints are yaw, lean, bend, roll, nod and twist, in rad: yaw, roll and twist turn about the link before them,
+    the others about the axis across. At 0 both links point up; `hand` is the tip from the wrist then. An angle of lean
+    above 0 leans towards x.
+    """
+    yaw, lean, bend, roll, nod, twist = angles
+    lower, upper = links
+    nothing = jnp.zeros_like(yaw)
+
+    def about_z(angle: Array, x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
+        return jnp.cos(angle) * x - jnp.sin(angle) * y, jnp.sin(angle) * x + jnp.cos(angle) * y, z
+
+    def about_y(angle: Array, x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
+        return jnp.cos(angle) * x + jnp.sin(angle) * z, y, jnp.cos(angle) * z - jnp.sin(angle) * x
+
+    def from_elbow(x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
+        return about_z(yaw, *about_y(lean, x, y, z + lower))
+
+    def from_wrist(x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
+        return from_elbow(*about_y(bend, x, y, z + upper))
+
+    place = about_z(roll, *about_y(nod, *about_z(twist, *(nothing + one for one in hand))))
+    return [from_elbow(nothing, nothing, nothing), from_wrist(nothing, nothing, nothing), from_wrist(*place)]

@@ -18,6 +18,7 @@ from envs.worlds.world import World, sole
 
 DPI = 100
 GOAL, TRAIL, ARM, TIP, INK, EDGE, PAPER = "#009e73", "#992673", "0.45", "#d98c40", "0.15", "0.6", "0.95"
+WATER, BLUE, GREEN = "#d6e6f2", "#4477aa", "#66bb55"
 
 
 def still(

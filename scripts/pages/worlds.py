@@ -15,8 +15,9 @@ IMAGES = Path(__file__).parents[2] / "docs" / "images"
 
 
 def main() -> None:
-    pen, throw = worlds.make("pen"), worlds.make("throw")
-    for name, world, task, goal in (("pen_line", pen, "line", 7), ("throw", throw, "thrown", 330)):
+    pen, throw, fishing, table = (worlds.make(name) for name in ("pen", "throw", "fishing", "table"))
+    shown_goals = (("pen_line", pen, "line", 7), ("throw", throw, "thrown", 330), ("fishing", fishing, "float", 77))
+    for name, world, task, goal in (*shown_goals, ("table", table, "tune", 3)):
         trace, _, shown = demonstration(world, task, goal)
         video.write(IMAGES / f"{name}.png", [draw.still(world, trace, **shown)])
     trace, length, shown = demonstration(pen, "character", 3)

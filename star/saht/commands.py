@@ -19,7 +19,7 @@ from star.config.loading import load_to_act, parse
 from star.config.section import ConfigError
 from star.saht import evaluation, teachers
 from star.saht.experiment import Saht
-from star.saht.memory import FAR
+from star.saht.memory import FAR, Memory, Scale
 from star.saht.teachers import Demonstrations
 from star.training.checkpoint import load_agent
 
@@ -126,8 +126,7 @@ def record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     for task, name in enumerate(world.names):
         key = jax.random.fold_in(modes.key(options.evaluation_seed), task)
         goals = jax.random.uniform(key, (options.episodes, 4), minval=world.lower[task], maxval=world.upper[task])
-        _, distance, row = evaluation.best(memory, rows, scale, task, goals)
-        mine = np.unique(np.asarray(row)[np.asarray(distance) < FAR / 2])
+        mine = _best(memory, rows, scale, task, goals)
         tasks += [name] * len(mine)
         found.append(mine)
     if not tasks:
@@ -135,8 +134,21 @@ def record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     chosen = np.concatenate(found)
     number = np.array([world.index(name) for name in tasks])
     outcomes = np.asarray(memory.outcomes)[number, :, chosen] * scale.width[number] + scale.lower[number]
-    demos = Demonstrations(np.asarray(memory.sequences)[chosen], np.asarray(memory.lengths)[chosen], outcomes)
+    pair, each = np.asarray(memory.pair)[chosen], len(world.tasks)
+    pairs = np.where(pair[:, None] >= 0, np.column_stack([pair // each, pair % each]), -1).astype(np.int32)
+    subgoals = np.asarray(memory.subgoals)[chosen] * scale.width[pairs] + scale.lower[pairs]
+    subgoals = np.where(pairs[..., None] >= 0, subgoals, 0.0).astype(np.float32)
+    sequences, lengths = np.asarray(memory.sequences)[chosen], np.asarray(memory.lengths)[chosen]
+    demos = Demonstrations(sequences, lengths, outcomes, pairs, subgoals)
     teachers.save(options.out, world, tasks, demos)
     counts = ", ".join(f"{name} {tasks.count(name)}" for name in world.names)
     print(f"{options.out}: {len(tasks)} demonstrations: {counts}")
     return 0
+
+
+def _best(memory: Memory, rows: int, scale: Scale, task: int, goals: Any) -> np.ndarray:
+    """The rows of a memory nearest to goals of a task, and those nearest of the ones that are procedures."""
+    _, distance, row = (np.asarray(x) for x in evaluation.best(memory, rows, scale, task, goals))
+    _, other, made = (np.asarray(x) for x in evaluation.best(memory, rows, scale, task, goals, procedures=True))
+    made = made[(other < FAR / 2) & (np.asarray(memory.pair)[made] >= 0)]
+    return np.unique(np.concatenate([row[distance < FAR / 2], made]))

@@ -19,18 +19,22 @@ from star.saht.memory import FAR, Memory, Piece, Scale, least, squared
 
 NEVER = 5.0
 """The error of a task that was never reached."""
-CLOSE = 0.1  # of the diagonal: goals whose nearest outcome is within it are counted as the area
+CLOSE = 0.1  # of the diagonal of the goals' box: goals whose nearest outcome is within it are counted as the area
 
 
 def best(
-    memory: Memory, rows: Array | int, scale: Scale, task: int, goals: Float[Array, "n 4"]
+    memory: Memory, rows: Array | int, scale: Scale, task: int, goals: Float[Array, "n 4"], *, procedures: bool = False
 ) -> tuple[Float[Array, "n"], Float[Array, "n"], Int[Array, "n"]]:
-    """Of the row nearest to each goal of a task: its distance in units of the world, its scaled one, and its number."""
+    """Of the row nearest to each goal of a task: its distance in units of the world, its scaled one, and its number.
+
+    With `procedures` of those rows that are one; where there are none it is any row.
+    """
     width = jnp.asarray(scale.width)[task]
     wanted = (goals - jnp.asarray(scale.lower)[task]) / width
 
     def value(part: Piece) -> Array:
-        return squared(part.outcomes * width[:, None], wanted * width)
+        square = squared(part.outcomes * width[:, None], wanted * width)
+        return jnp.where(part.pair >= 0, square, jnp.inf) if procedures else square
 
     _, row = least(memory, rows, jnp.asarray(task), value, (len(goals),))
     apart = memory.outcomes[task, :, row] - wanted
@@ -51,7 +55,8 @@ def errors(
     for task, name in enumerate(world.names):
         wanted = jnp.asarray(goals[task])
         error, scaled, row = best(memory, rows, scale, task, wanted)
-        found |= {f"error_{name}": error.mean(), f"area_{name}": (scaled < CLOSE).mean()}
+        close = CLOSE * float(np.linalg.norm(np.ptp(goals[task], axis=0)))
+        found |= {f"error_{name}": error.mean(), f"area_{name}": ((error < close) & (scaled < FAR / 2)).mean()}
         if world.noise:
             again = world.execute(memory.sequences[row], memory.lengths[row], key=jax.random.fold_in(key, task))
             apart = jnp.linalg.norm(again.value[:, task] - wanted, axis=-1)

@@ -16,8 +16,8 @@ from envs.common.errors import UserError, where_raised
 from star.config.section import ConfigError
 from star.saht import choose, evaluation, loop, memory, teachers
 from star.saht.loop import SPLIT_EVERY, Seen, State
+from star.saht.proposals import Setting, Way
 from star.saht.sections import Config, Learner
-from star.saht.strategies import Setting, Way
 from star.saht.teachers import Shown
 from star.sgim import selection
 from star.training.experiment import Experiment, numbers, over_seeds
@@ -56,6 +56,13 @@ class Saht(Experiment):
             raise ConfigError(
                 f"saht: procedures need sequences of two primitives; those of {self.world.name} have {longest}"
             )
+        unable = [task.name for task in self.world.tasks if task.demonstrate is None]
+        for name in {"dagger", "cba"} & set(section.strategies):
+            if unable:
+                raise ConfigError(
+                    f"saht.strategies: {name} needs a teacher of every task; nobody demonstrates {unable[0]} in "
+                    f"{self.world.name}"
+                )
         if _iterations(config) > (section.memory or 0):
             raise ConfigError(
                 f"trainer.total_env_steps: {config.trainer.total_env_steps}, in whole epochs of {section.epoch}, is "
@@ -140,7 +147,7 @@ class Saht(Experiment):
             for key, values in table.items()
             for i, name in enumerate(names)
         }
-        return found | {"saht/refused": seen.refused.sum()}
+        return found | {"saht/refused": seen.refused.sum(), "saht/asked": seen.asked.sum()}
 
     def evaluate(self, hyper: Learner, state: State, keys: Array) -> dict[str, Array]:
         """Errors on the goals of the evaluation."""
@@ -187,7 +194,7 @@ def ways(config: Config, world: worlds.World) -> tuple[Way, ...]:
     """The strategies in the order of their numbers: those alone, then the teachers."""
     alone = [Way(name, name) for name in config.saht.strategies]
     asked = [
-        Way(one.name or "", one.kind, world.index(one.task or 0), number)
+        Way(one.name or "", one.kind, world.index(one.task or 0), number, one.source != "world")
         for number, one in enumerate(config.saht.teachers)
     ]
     return (*alone, *asked)

@@ -16,7 +16,7 @@ from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocat
 
 from envs.worlds import World
 from star.report.statistics import over_seeds
-from star.saht.strategies import Way
+from star.saht.proposals import Way
 from star.training.figures import literal
 from star.training.journal import by_step
 
@@ -26,6 +26,8 @@ KINDS = {
     "random": ("random", "0.7"),
     "actions": ("actions, alone", "#4477aa"),
     "procedures": ("procedures, alone", "#228833"),
+    "dagger": ("DAgger", "#66ccee"),
+    "cba": ("confidence-based autonomy", "#994455"),
     "action": ("teachers of actions", "#ee99aa"),
     "outcome": ("teachers of outcomes", "#ccbb44"),
     "procedure": ("teachers of procedures", "#aa3377"),

@@ -39,17 +39,21 @@ def regress(
     return mean + (goal - middle) / reach @ slopes
 
 
+def same_way(memory: Memory, near: Neighbours) -> Bool[Array, "k"]:
+    """Which neighbours have the length of the best one, and do it in the same way: two ways must not be averaged."""
+    sequences, lengths = memory.sequences[near.rows], memory.lengths[near.rows]
+    _, longest, numbers = sequences.shape
+    played = (jnp.arange(longest) < lengths[0])[:, None]
+    apart = jnp.sum(jnp.square(sequences - sequences[0]) * played, axis=(1, 2)) / (lengths[0] * numbers)
+    return near.known & (lengths == lengths[0]) & (apart <= SAME_WAY**2)
+
+
 def action(memory: Memory, near: Neighbours, goal: Float[Array, "4"], dims: Array) -> Float[Array, "L p"]:
     """A sequence, as long as that of the best neighbour, for a goal of so many dimensions.
 
-    Neighbours count that have its length and do it in the same way: two ways must not be averaged. Where fewer than
-    `dims` + 1 remain it is the best one's own.
+    Neighbours count that do it in the same way. Where fewer than `dims` + 1 remain it is the best one's own.
     """
-    sequences, lengths = memory.sequences[near.rows], memory.lengths[near.rows]
-    k, longest, numbers = sequences.shape
-    played = (jnp.arange(longest) < lengths[0])[:, None]
-    apart = jnp.sum(jnp.square(sequences - sequences[0]) * played, axis=(1, 2)) / (lengths[0] * numbers)
-    used = near.known & (lengths == lengths[0]) & (apart <= SAME_WAY**2)
-    found = regress(near.outcomes, sequences.reshape(k, -1), near.distances, used, goal)
+    sequences, used = memory.sequences[near.rows], same_way(memory, near)
+    found = regress(near.outcomes, sequences.reshape(len(sequences), -1), near.distances, used, goal)
     enough = used.sum() > dims
-    return jnp.clip(jnp.where(enough, found.reshape(longest, numbers), sequences[0]), -1.0, 1.0)
+    return jnp.clip(jnp.where(enough, found.reshape(sequences.shape[1:]), sequences[0]), -1.0, 1.0)

@@ -21,8 +21,8 @@ from envs.worlds import World
 from star.saht import choose, memory, strategies
 from star.saht.choose import Choice, Progress, Tables
 from star.saht.memory import FAR, Memory
+from star.saht.proposals import Order, Proposals, Setting
 from star.saht.sections import ChoiceConfig, SahtConfig
-from star.saht.strategies import Order, Proposals, Setting
 
 SPLIT_EVERY = 25  # blocks
 
@@ -56,6 +56,7 @@ class Seen(NamedTuple):
     length: Float[Array, ""]
     reached: Int[Array, "S"]
     refused: Int[Array, ""]
+    asked: Int[Array, ""]
 
 
 def init(config: ChoiceConfig, world: World, ways: int, rows: int, *, key: Array) -> State:
@@ -92,11 +93,18 @@ def block(
         made = strategies.propose(setting, known, rows, order, key=propose_key)
         found, refused = execute(setting, made, key=execute_key)
         new = memory.distances(known, rows, found.outcomes.transpose(2, 0, 1))
-        return memory.write(known, rows, found), (found.outcomes, new, found.lengths, found.pair, refused)
+        return memory.write(known, rows, found), (
+            found.outcomes,
+            new,
+            found.lengths,
+            found.pair,
+            refused,
+            made.asked.sum(),
+        )
 
     parts = jnp.arange(config.block // config.generation)
     known, out = jax.lax.scan(generation, state.memory, (parts, jnp.stack(keys)))
-    outcomes, new, lengths, pair, refused = out
+    outcomes, new, lengths, pair, refused, asked = out
     outcomes = jnp.moveaxis(outcomes, -1, 1).reshape(config.block, *outcomes.shape[1:3])  # [K, S, 4]
     reached = outcomes[..., 0] < FAR / 2
     after = jnp.sqrt(memory.squared(outcomes[:, choice.task].T, goal).min())
@@ -111,6 +119,7 @@ def block(
         lengths.mean(dtype=jnp.float32),
         reached.sum(axis=0),
         refused.sum(),
+        asked.sum(),
     )
 
 

@@ -20,7 +20,7 @@ class WorldConfig(Section):
     noise: float = setting(
         0.0, "All numbers of executed primitives get noise of this standard deviation.", unit="", ge=0, le=1
     )
-    options: dict[str, Any] = setting({}, "These options are passed to your own world.", allowed="options of the world")
+    options: dict[str, Any] = setting({}, "These options are passed to the world.", allowed="options of the world")
 
     _import_nothing_that_only_a_file_names = field_validator("name")(module_name)
     _refuse_what_no_option_holds = field_validator("options")(simple)
@@ -60,8 +60,6 @@ class TeacherConfig(Section):
     def _files_name_their_task(self) -> Self:
         if self.task is None and (self.source != "world" or self.name is not None):
             raise ValueError("a teacher with a file or a name needs its task")
-        if self.kind == "procedure" and self.source != "world":
-            raise ValueError(f"source: {self.source!r}: files show no procedures; allowed: world")
         if self.kind == "procedure" and self.flaw is not None:
             raise ValueError(f"flaw: {self.flaw!r} is of teachers with demonstrations; allowed with procedure: null")
         return self
@@ -99,8 +97,10 @@ class ChoiceConfig(Section):
 class SahtConfig(Section):
     """A learner's abilities and choices."""
 
-    strategies: tuple[Literal["random", "actions", "procedures"], ...] = setting(
-        ("actions",), "These are the ways to practise alone: at random, by what is near the goal, or by two subgoals."
+    strategies: tuple[Literal["random", "actions", "procedures", "dagger", "cba"], ...] = setting(
+        ("actions",),
+        "These are the ways to practise: at random, by what is near the goal, or by two subgoals; "
+        "and imitation learning, which asks the world's teachers by itself.",
     )
     teachers: tuple[TeacherConfig, ...] = setting(
         (), "These teachers may be asked for help.", allowed="with the keys below", max_length=64
@@ -136,6 +136,9 @@ class SahtConfig(Section):
             raise ValueError(f"strategies: {twice} is given twice")
         if not self.strategies and any(one.availability < 1 or one.max_queries for one in self.teachers):
             raise ValueError("strategies: there are none, so teachers need availability 1 and max_queries null")
+        paired = [name for name in self.strategies if name in ("dagger", "cba")]
+        if paired and self.generation % 2:
+            raise ValueError(f"generation: {self.generation} is odd; {paired[0]} needs pairs of iterations")
         if self.ask_every is not None and not (self.strategies and self.teachers):
             raise ValueError("ask_every: needs strategies and teachers to change between")
         return self

@@ -7,6 +7,7 @@
     action        a teacher's demonstration, then the same with noise (mimicry)
     outcome       the goal becomes what a teacher has reached, then as `actions` (emulation)
     procedure     by the two subgoals that a teacher names
+    dagger, cba   imitation learning of others, in files of their own
 
 Each subgoal becomes the nearest outcome that was reached, and what reached the two is executed, one after the other.
 
@@ -15,111 +16,27 @@ All functions are of one learner and make a generation of G sequences. docs/saht
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from envs.common.batching import where
-from envs.worlds import World
-from star.saht import inverse
+from star.saht import cba, dagger, inverse
 from star.saht.choose import drawn
-from star.saht.memory import FAR, Memory, Neighbours, Piece, Scale, least, neighbours, rank, squared
-from star.saht.teachers import Shown
+from star.saht.memory import FAR, NEIGHBOURS, Memory, Neighbours, Piece, least, neighbours, rank, squared
+from star.saht.proposals import Dice, Order, Proposals, Setting, anywhere, plain
 
-NEIGHBOURS = 10
+ASKED = ("action", "outcome", "procedure")
+"""Kinds of strategies that are teachers."""
 CERTAIN = 0.3  # distance of the best known outcome from which on a learner explores most
 LOCAL = (0.1, 0.9)  # least and largest chance of staying near what is known
 BY_MODEL, BY_REGRESSION = 0.5, 0.7  # chance of a regression rather than the best neighbour: of actions, of procedures
 NOISE, NOISE_MORE, NOISE_MOST = 0.01, 0.5, 0.3  # standard deviation: at distance 0, what a distance of 1 adds, at most
 VARIED = 0.5  # chance of each number of a sequence to get noise
 RETRY = 0.05  # standard deviation of what is added to what a teacher has shown
-
-
-class Way(NamedTuple):
-    """A strategy as a learner knows it."""
-
-    name: str
-    kind: str
-    task: int = 0
-    """The task of its teacher, if it has one."""
-    teacher: int = 0
-    """The number of its teacher in `Shown`."""
-
-
-class Setting(NamedTuple):
-    """The needs of strategies besides the memory."""
-
-    world: World
-    scale: Scale
-    ways: tuple[Way, ...]
-    shown: Shown
-    generation: int
-    """G."""
-
-    def of_way(self, way: Array, name: str) -> Array:
-        """The notes on a strategy, by its number."""
-        return jnp.array([getattr(one, name) for one in self.ways])[way]
-
-
-class Order(NamedTuple):
-    """The exercise: a scaled goal of a task, by the strategy number `way`."""
-
-    task: Int[Array, ""]
-    goal: Float[Array, "4"]
-    way: Int[Array, ""]
-    first: Bool[Array, ""]
-    """True if a block begins with it: then the first sequence is as a teacher shows it."""
-
-
-class Proposals(struct.PyTreeNode):
-    """A generation of sequences."""
-
-    sequences: Float[Array, "G L p"]
-    lengths: Int[Array, "G"]
-    pair: Int[Array, "G"]
-    """Of the procedure that each is made of, as in `Memory`."""
-    subgoals: Float[Array, "G 2 4"]
-
-
-class Dice(NamedTuple):
-    """Random numbers of a generation. Kinds of strategies share them: of all that is made one kind is executed.
-
-    Few calls for many numbers: each takes as long to compile as all that a strategy does.
-    """
-
-    anywhere: Float[Array, "G L p"]
-    """Even in [-1, 1]; all others in [0, 1), or normal."""
-    varied: Float[Array, "G L p"]
-    normal: Float[Array, "G L p"]
-    goals: Float[Array, "G 2 4"]
-    normal_goals: Float[Array, "G 2 4"]
-    length: Float[Array, "G"]
-    local: Float[Array, "G"]
-    model: Float[Array, "G"]
-    once: Float[Array, "8"]
-
-    @classmethod
-    def thrown(cls, world: World, g: int, *, key: Array) -> Dice:
-        """For G sequences in a world."""
-        even_key, normal_key = jax.random.split(key)
-        sequences, two, one = (g, world.longest, world.primitive), (g, 2, 4), (g,)
-        even = _parts(jax.random.uniform, even_key, [sequences, sequences, two, one, one, one, (8,)])
-        normal = _parts(jax.random.normal, normal_key, [sequences, two])
-        anywhere, varied, goals, length, local, model, once = even
-        return cls(2 * anywhere - 1, varied, normal[0], goals, normal[1], length, local, model, once)
-
-
-def _parts(draw: Any, key: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    """The draws of one call, in these shapes."""
-    sizes = np.array([math.prod(shape) for shape in shapes])
-    parts = jnp.split(draw(key, (int(sizes.sum()),)), np.cumsum(sizes)[:-1])
-    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
 
 class Two(NamedTuple):
@@ -135,12 +52,12 @@ def propose(setting: Setting, memory: Memory, rows: Array, order: Order, *, key:
     kinds = {way.kind for way in setting.ways}
     made: dict[str, Proposals] = {}
     if "random" in kinds:
-        made["random"] = _plain(anywhere(setting, dice))
+        made["random"] = plain(anywhere(setting, dice))
     if kinds & {"actions", "outcome"}:
-        aimed = _plain(actions(setting, memory, rows, *aim(setting, order), dice))
+        aimed = plain(actions(setting, memory, rows, *aim(setting, order), dice))
         made |= {kind: aimed for kind in ("actions", "outcome") if kind in kinds}
     if "action" in kinds:
-        made["action"] = _plain(mimicked(setting, order, dice))
+        made["action"] = plain(mimicked(setting, order, dice))
     two: dict[str, Two] = {}
     if "procedures" in kinds:
         two["procedures"] = composed(setting, memory, rows, order, dice)
@@ -148,9 +65,16 @@ def propose(setting: Setting, memory: Memory, rows: Array, order: Order, *, key:
         two["procedure"] = taught(setting, order, dice)
     if two:
         made |= dict.fromkeys(two, refine(setting, memory, rows, _of_kind(setting, order, two), dice))
+    if "dagger" in kinds:
+        made["dagger"] = dagger.propose(setting, memory, rows, order, dice)
+    if "cba" in kinds:
+        made["cba"] = cba.propose(setting, memory, rows, order, dice, key=key)
     chosen = _of_kind(setting, order, made)
     played = jnp.arange(setting.world.longest) < chosen.lengths[:, None]
-    return chosen.replace(sequences=jnp.where(played[..., None], jnp.clip(chosen.sequences, -1.0, 1.0), 0.0))
+    return chosen.replace(
+        sequences=jnp.where(played[..., None], jnp.clip(chosen.sequences, -1.0, 1.0), 0.0),
+        asked=chosen.asked | jnp.array([way.kind in ASKED for way in setting.ways])[order.way],
+    )
 
 
 def _of_kind(setting: Setting, order: Order, made: Mapping[str, Any]) -> Any:
@@ -160,19 +84,6 @@ def _of_kind(setting: Setting, order: Order, made: Mapping[str, Any]) -> Any:
         mine = jnp.array([way.kind == kind for way in setting.ways])[order.way]
         chosen = where(mine, one, chosen)
     return chosen
-
-
-def _plain(made: tuple[Array, Array]) -> Proposals:
-    """Sequences that are no procedures."""
-    g = len(made[1])
-    return Proposals(*made, pair=jnp.full(g, -1, jnp.int32), subgoals=jnp.zeros((g, 2, 4)))
-
-
-def anywhere(setting: Setting, dice: Dice) -> tuple[Float[Array, "G L p"], Int[Array, "G"]]:
-    """Random sequences, each primitive more half as likely."""
-    weights = 0.5 ** np.arange(setting.world.longest)
-    below = np.cumsum(weights)[:-1] / weights.sum()
-    return dice.anywhere, 1 + jnp.sum(dice.length[:, None] >= below, axis=1, dtype=jnp.int32)
 
 
 def aim(setting: Setting, order: Order) -> tuple[Array, Array]:
@@ -250,15 +161,23 @@ def composed(setting: Setting, memory: Memory, rows: Array, order: Order, dice: 
 
 
 def taught(setting: Setting, order: Order, dice: Dice) -> Two:
-    """The subgoals that the teacher names for the goal, or for any one of his task if the goal is of another."""
+    """The subgoals that the teacher names for the goal, or for any one of his task if the goal is of another.
+
+    One from a file names those of the procedure whose outcome is nearest.
+    """
     task = setting.of_way(order.way, "task")
     goal = jnp.where(task == order.task, order.goal, setting.scale.unit(task, dice.once[4:]))
     named: Two | None = None
-    for known in {way.task: None for way in setting.ways if way.kind == "procedure"}:
+    asked = [way for way in setting.ways if way.kind == "procedure"]
+    for known in {way.task: None for way in asked if not way.recorded}:
         parts = setting.world.decompose(known, setting.scale.value(known, goal))
         lower, width = (jnp.asarray(one)[parts.tasks] for one in (setting.scale.lower, setting.scale.width))
         one = Two(parts.tasks, (parts.goals - lower) / width)
         named = one if named is None else where(task == known, one, named)
+    if any(way.recorded for way in asked):
+        teacher, nearest = setting.of_way(order.way, "teacher"), _nearest(setting, order._replace(goal=goal))
+        one = Two(setting.shown.pairs[teacher, nearest], setting.shown.subgoals[teacher, nearest])
+        named = one if named is None else where(setting.of_way(order.way, "recorded"), one, named)
     assert named is not None
     top = jnp.asarray(setting.scale.top)[named.tasks]
     return Two(named.tasks, named.goals + RETRY * top * dice.normal_goals * _but_first(setting, order))
@@ -292,4 +211,5 @@ def refine(setting: Setting, memory: Memory, rows: Array, two: Two, dice: Dice) 
         lengths=jnp.where(fits, length + memory.lengths[second], lengths),
         pair=jnp.where(fits, two.tasks[0] * len(setting.world.tasks) + two.tasks[1], -1),
         subgoals=jnp.where(fits[:, None, None], subgoals, 0.0),
+        asked=jnp.zeros(setting.generation, bool),
     )

@@ -8,6 +8,10 @@ A file is an `.npz` (numpy.savez) with these arrays and no others:
     sequences   [N, L, p]      numbers in [-1, 1]
     lengths     [N]            whole numbers from 1 to L
     outcomes    [N, 4]         in the outcome space of the task, then 0
+    pairs       [N, 2]         whole numbers: the tasks of the procedure that it was made of, or -1
+    subgoals    [N, 2, 4]      in the outcome spaces of these tasks, then 0
+
+The last two are there together or not at all. With them a file shows procedures too, to learners with any body.
 """
 
 from __future__ import annotations
@@ -31,9 +35,10 @@ from star.saht.sections import TeacherConfig
 from star.sgim import teachers as sgim_teachers
 
 FORMAT = 1
-SKILFUL = 0.05  # a teacher shows goals that he reaches up to this share of the diagonal
-TRIES = 64  # goals that a teacher tries for each that he shows
+SKILFUL = 0.05  # a teacher shows goals that he reaches up to this share of the diagonal of the evaluation's goals
+TRIES, ROUNDS = 64, 64  # goals that a teacher tries at once for each that he shows, and how often at most
 _NAMES = ("format", "world", "tasks", "sequences", "lengths", "outcomes")
+_PROCEDURES = ("pairs", "subgoals")
 
 
 class Demonstrations(NamedTuple):
@@ -42,14 +47,26 @@ class Demonstrations(NamedTuple):
     sequences: Float[np.ndarray, "N L p"]
     lengths: Int[np.ndarray, "N"]
     outcomes: Float[np.ndarray, "N 4"]
+    pairs: Int[np.ndarray, "N 2"]
+    """Tasks of the procedures that they were made of; -1 if they were not."""
+    subgoals: Float[np.ndarray, "N 2 4"]
+
+    @classmethod
+    def plain(cls, sequences: np.ndarray, lengths: np.ndarray, outcomes: np.ndarray) -> Demonstrations:
+        """Those that are no procedures."""
+        n = len(lengths)
+        return cls(sequences, lengths, outcomes, np.full((n, 2), -1, np.int32), np.zeros((n, 2, 4), np.float32))
 
 
 class Shown(struct.PyTreeNode):
-    """The demonstrations of T teachers, up to D each; procedural ones show none."""
+    """The demonstrations of T teachers, up to D each; procedural ones of the world itself show none."""
 
     sequences: Float[Array, "T D L p"]
     lengths: Int[Array, "T D"]
     outcomes: Float[Array, "T D 4"]
+    """Scaled."""
+    pairs: Int[Array, "T D 2"]
+    subgoals: Float[Array, "T D 2 4"]
     """Scaled."""
     counts: Int[Array, "T"]
 
@@ -93,20 +110,26 @@ def shown_by(teachers: Sequence[TeacherConfig], world: World, scale: Scale) -> S
 
     if not all_shown:
         all_shown = [_nothing(world)]
-    sequences, lengths, outcomes = (stacked(leaves) for leaves in zip(*all_shown, strict=True))
+    sequences, lengths, outcomes, pairs, subgoals = (stacked(leaves) for leaves in zip(*all_shown, strict=True))
     tasks = np.array([world.index(teacher.task or 0) for teacher in teachers] or [0])
     outcomes = (outcomes - scale.lower[tasks, None]) / scale.width[tasks, None]
+    subgoals = (subgoals - jnp.asarray(scale.lower)[pairs]) / jnp.asarray(scale.width)[pairs]
     counts = jnp.array([len(demos.lengths) for demos in all_shown])
-    return Shown(sequences, lengths, outcomes, counts)
+    return Shown(sequences, lengths, outcomes, pairs, subgoals, counts)
 
 
 def _demonstrations(teacher: TeacherConfig, world: World, scale: Scale) -> Demonstrations:
-    if teacher.kind == "procedure":
-        return _nothing(world)
     if teacher.source == "world":
+        if teacher.kind == "procedure":
+            return _nothing(world)
         demos = demonstrated(world, world.index(teacher.task or 0), teacher.demos, scale)
     else:
         demos = load(Path(teacher.source), world, teacher.task or "", sha256=teacher.sha256)
+    if teacher.kind == "procedure":
+        made = demos.pairs[:, 0] >= 0
+        if not made.any():
+            raise ConfigError(f"{teacher.source}: shows no procedure of {teacher.task}")
+        return Demonstrations(*(leaf[made] for leaf in demos))
     if teacher.flaw == "repetitive":
         return Demonstrations(*(leaf[:1] for leaf in demos))
     if teacher.flaw == "other_body":
@@ -115,9 +138,8 @@ def _demonstrations(teacher: TeacherConfig, world: World, scale: Scale) -> Demon
 
 
 def _nothing(world: World) -> Demonstrations:
-    return Demonstrations(
-        np.zeros((1, world.longest, world.primitive), np.float32), np.ones(1, np.int32), np.zeros((1, 4), np.float32)
-    )
+    sequences = np.zeros((1, world.longest, world.primitive), np.float32)
+    return Demonstrations.plain(sequences, np.ones(1, np.int32), np.zeros((1, 4), np.float32))
 
 
 def demonstrated(world: World, task: int, count: int, scale: Scale) -> Demonstrations:
@@ -126,20 +148,25 @@ def demonstrated(world: World, task: int, count: int, scale: Scale) -> Demonstra
     Raises:
       UserError: in one line, if he reaches too few.
     """
-    key = modes.key(task)
     lower, upper = jnp.asarray(world.lower)[task], jnp.asarray(world.upper)[task]
-    goals = jax.random.uniform(key, (TRIES * count, 4), minval=lower, maxval=upper)
-    sequences, lengths = world.demonstrate(task, goals)
-    found = world.execute(jnp.clip(sequences, -1.0, 1.0), lengths, key=key)
-    apart = jnp.linalg.norm((found.value[:, task] - goals) / scale.width[task], axis=-1)
-    kept = np.flatnonzero(np.asarray(found.reached[:, task] & (apart < SKILFUL)))[:count]
-    if len(kept) < count:
-        raise ConfigError(
-            f"saht.teachers: the teacher of {world.names[task]} reaches {len(kept)} of {TRIES * count} goals; "
-            f"allowed: at least {count}, its demos"
-        )
-    shown = jnp.clip(sequences, -1.0, 1.0), lengths, found.value[:, task]
-    return Demonstrations(*(np.asarray(leaf)[kept] for leaf in shown))
+    reach = np.linalg.norm(np.ptp(world.benchmark(task), axis=0) / scale.width[task])
+    kept: list[tuple[np.ndarray, ...]] = []
+    for turn in range(ROUNDS):
+        key = modes.key(task) if turn == 0 else jax.random.fold_in(modes.key(task), turn)
+        goals = jax.random.uniform(key, (TRIES * count, 4), minval=lower, maxval=upper)
+        sequences, lengths = world.demonstrate(task, goals)
+        found = world.execute(jnp.clip(sequences, -1.0, 1.0), lengths, key=key)
+        apart = jnp.linalg.norm((found.value[:, task] - goals) / scale.width[task], axis=-1)
+        near = np.asarray(found.reached[:, task] & (apart < SKILFUL * reach))
+        shown = jnp.clip(sequences, -1.0, 1.0), lengths, found.value[:, task]
+        kept.append(tuple(np.asarray(leaf)[near] for leaf in shown))
+        together = [np.concatenate(leaves)[:count] for leaves in zip(*kept, strict=True)]
+        if len(together[0]) == count:
+            return Demonstrations.plain(*together)
+    raise ConfigError(
+        f"saht.teachers: the teacher of {world.names[task]} reaches {len(together[0])} of {ROUNDS * TRIES * count} "
+        f"goals; allowed: at least {count}, its demos"
+    )
 
 
 def save(path: Path, world: World, tasks: Sequence[str], demos: Demonstrations) -> None:
@@ -167,34 +194,41 @@ def load(path: Path, world: World, task: str, *, sha256: str | None = None) -> D
     if not mine.any():
         there = ", ".join(dict.fromkeys(map(str, arrays["tasks"])))
         raise ConfigError(f"{path}: shows nothing of {task}; it holds {there}")
-    return Demonstrations(
+    found = Demonstrations.plain(
         arrays["sequences"][mine].astype(np.float32),
         arrays["lengths"][mine].astype(np.int32),
         arrays["outcomes"][mine].astype(np.float32),
     )
+    own = {name: arrays[name][mine].astype(getattr(found, name).dtype) for name in _PROCEDURES if name in arrays}
+    return found._replace(**own)
 
 
 def _check(arrays: dict[str, np.ndarray], world: World) -> None:
     """Raise `ValueError` unless the arrays are demonstrations in this world."""
-    for name in (*_NAMES, *arrays):
+    wanted = _NAMES + _PROCEDURES * any(name in arrays for name in _PROCEDURES)
+    for name in (*wanted, *arrays):
         if name not in arrays:
             raise ValueError(f"holds no {name}; is it a file of demonstrations in a world?")
-        if name not in _NAMES:
-            raise ValueError(f"holds an unknown array {name!r}; allowed: {', '.join(_NAMES)}")
+        if name not in wanted:
+            raise ValueError(f"holds an unknown array {name!r}; allowed: {', '.join(_NAMES + _PROCEDURES)}")
     if arrays["format"].shape or arrays["format"].dtype.kind not in "iu" or arrays["format"] != FORMAT:
         raise ValueError(f"format is not {FORMAT}, the one that this version reads")
     if str(arrays["world"]) != world.name:
         raise ValueError(f"holds demonstrations in {str(arrays['world'])!r}, not in {world.name!r}")
     n = len(np.atleast_1d(arrays["tasks"]))
     shapes = {"tasks": (n,), "sequences": (n, world.longest, world.primitive), "lengths": (n,), "outcomes": (n, 4)}
-    kinds = {"tasks": "U", "sequences": "f", "lengths": "iu", "outcomes": "f"}
-    for name, shape in shapes.items():
-        array = arrays[name]
+    shapes |= {"pairs": (n, 2), "subgoals": (n, 2, 4)}
+    kinds = {"tasks": "U", "sequences": "f", "lengths": "iu", "outcomes": "f", "pairs": "iu", "subgoals": "f"}
+    for name in wanted[2:]:
+        array, shape = arrays[name], shapes[name]
         if array.shape != shape or array.dtype.kind not in kinds[name]:
             raise ValueError(
                 f"{name} is {array.dtype}{list(array.shape)}; allowed: {list(shape)} of kind {kinds[name]}"
             )
-    for name, low, high in (("sequences", -1, 1), ("lengths", 1, world.longest), ("outcomes", -np.inf, np.inf)):
+    limits = {"sequences": (-1, 1), "lengths": (1, world.longest), "outcomes": (-np.inf, np.inf)}
+    limits |= {"pairs": (-1, len(world.tasks) - 1), "subgoals": (-np.inf, np.inf)}
+    for name in wanted[3:]:
+        low, high = limits[name]
         bad = ~(np.isfinite(arrays[name]) & (arrays[name] >= low) & (arrays[name] <= high))
         if bad.any():
             where = np.argwhere(bad)[0]

@@ -13,8 +13,9 @@ import yaml
 
 from star.cli import main
 from star.config.loading import parse
-from star.saht import teachers
+from star.saht import strategies, teachers
 from star.saht.memory import scale_of
+from star.saht.proposals import Dice, Order
 from star.training import program as programs
 from star.training.journal import JsonLines
 from tests.small import arrays
@@ -154,6 +155,32 @@ def test_what_a_learner_can_do_is_recorded_and_teaches_others(capsys):
     np.testing.assert_allclose(shown.outcomes[0] * scale.width[1] + scale.lower[1], demos.outcomes, atol=1e-5)
 
 
+def test_procedures_that_a_learner_has_found_are_recorded_and_shown_to_others():
+    assert main(["record", "whole", "--seed", "1", "--out", "procedures.npz", "--episodes", "30"]) == 0
+    experiment = programs.build(parse(CONFIG)).experiment
+    world, scale = experiment.world, experiment.scale
+    demos = teachers.load(Path("procedures.npz"), world, "bell")
+    made = demos.pairs[:, 0] >= 0
+    assert made.any() and not demos.subgoals[~made].any()
+    file = [{"kind": "procedure", "task": "bell", "source": "procedures.npz"}]
+    taught = programs.build(parse(CONFIG, {"saht.teachers": file})).experiment
+    shown, setting = taught.data(), taught.setting(taught.data())
+    (way,) = (number for number, way in enumerate(taught.ways) if way.kind == "procedure")
+    n = int(made.sum()) - 1
+    order = Order(np.int32(1), shown.outcomes[0, n], np.int32(way), np.asarray(True))
+    two = strategies.taught(setting, order, Dice.thrown(world, setting.generation, key=jax.random.key(0)))
+    number = np.flatnonzero((shown.outcomes[0] == shown.outcomes[0, n]).all(axis=1))[0]
+    np.testing.assert_array_equal(two.tasks, demos.pairs[made][number])
+    wanted = demos.subgoals[made][number]
+    found = two.goals[0] * scale.width[two.tasks] + scale.lower[two.tasks]
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
+    with pytest.raises(ValueError, match="shows no procedure of place"):
+        plain = teachers.Demonstrations.plain(demos.sequences[:1], demos.lengths[:1], demos.outcomes[:1])
+        teachers.save(Path("plain.npz"), world, ["place"], plain)
+        file = [{"kind": "procedure", "task": "place", "source": "plain.npz"}]
+        programs.build(parse(CONFIG, {"saht.teachers": file})).experiment.data()
+
+
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
@@ -169,12 +196,14 @@ def test_what_a_learner_can_do_is_recorded_and_teaches_others(capsys):
         (lambda a: a | {"tasks": np.full_like(a["tasks"], "x")}, "shows nothing of bell; it holds x"),
         (lambda a: {k: v for k, v in a.items() if k != "outcomes"}, "holds no outcomes"),
         (lambda a: a | {"more": 1}, "holds an unknown array 'more'"),
+        (lambda a: a | {"pairs": a["pairs"] + 3}, r"pairs\[0, 0\] is 2; allowed: -1 to 1"),
+        (lambda a: {k: v for k, v in a.items() if k != "subgoals"}, "holds no subgoals"),
     ],
 )
 def test_a_file_that_is_no_file_of_this_world_is_refused(damage, said):
     world = programs.build(parse(CONFIG)).experiment.world
     sequences, lengths = world.demonstrate("place", world.benchmark("place")[:4])
-    demos = teachers.Demonstrations(
+    demos = teachers.Demonstrations.plain(
         np.asarray(sequences), np.asarray(lengths), np.asarray(world.benchmark("place")[:4])
     )
     teachers.save(Path("some.npz"), world, ["bell"] * 4, demos)
@@ -210,7 +239,11 @@ def test_budgets_availability_and_turns_say_which_strategies_there_are():
         ),
         ({"saht.teachers": [{"kind": "action"}, {"kind": "action"}]}, "saht.teachers: action_place is given twice"),
         ({"saht.teachers": [{"kind": "action", "name": "x"}]}, "needs its task"),
-        ({"saht.teachers": [{"kind": "procedure", "task": "bell", "source": "x.npz"}]}, "files show no procedures"),
+        ({"saht.strategies": ["dagger"]}, "dagger needs a teacher of every task; nobody demonstrates bell in cart"),
+        (
+            {"saht.strategies": ["cba"], "saht.block": 15, "saht.epoch": 60, "saht.generation": 15},
+            "15 is odd; cba needs",
+        ),
         ({"saht.strategies": [], "saht.teachers": []}, "there are none, and no teachers"),
         ({"saht.generation": 3}, "generation: 3 does not divide block 10"),
         ({"saht.epoch": 55}, "epoch: 55 is not a multiple of block 10"),

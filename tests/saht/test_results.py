@@ -3,12 +3,14 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.scripts import load
 
+ROOT = Path(__file__).parents[2]
 TASKS = ("tip", "pen", "line", "joystick_1", "joystick_2", "character")
 
 
@@ -68,6 +70,75 @@ def test_claims_hold_or_fail_as_the_numbers_say(monkeypatch):
     assert told.count("**failed**") == sum(not claim.holds for claim in failed) and "| sgim_pb | 0.120 [" in told
 
 
+def imitator(error, asked):
+    """Four seeds whose error falls evenly to a half while a teacher is asked."""
+    errors = [[x * level for x in (0.99, 1.0, 1.0, 1.01)] for level in (error, 0.75 * error, 0.5 * error)]
+    return {"errors": {"mean": errors}, "asked": [[share * asked] * 4 for share in (0.0, 0.5, 1.0)]}
+
+
+def test_imitators_are_compared_where_all_have_asked_as_much(monkeypatch):
+    script = load("results/saht")
+    monkeypatch.setattr(script, "stratified", without_draws)
+    found = {"sgim_acts": imitator(0.2, 1000), "dagger": imitator(0.2, 2000), "cba": imitator(0.1, 500)}
+    claims = {claim.text: claim for claim in script.at_equal_cost(found)}
+    (dagger, cba) = claims.values()
+    assert all("after 500 requests" in text for text in claims)
+    assert dagger.value == pytest.approx(0.15 - 0.175) and dagger.holds
+    assert cba.value == pytest.approx(0.15 - 0.05) and not cba.holds
+    assert script.draw_taught(found).axes[0].get_legend().get_texts()[1].get_text() == "dagger"
+    assert script.at_equal_cost({"sgim_acts": imitator(0.2, 9), "throw": {"asked": []}}) == []
+
+
+def test_claims_about_fishing_and_the_table_hold_or_fail_as_the_numbers_say(monkeypatch):
+    script = load("results/saht")
+    monkeypatch.setattr(script, "stratified", without_draws)
+
+    def fishing(error, area):
+        return algorithm(error) | {"areas": [[area] * 4]}
+
+    found = {"sgim_d_wide": fishing(0.1, 0.6), "mimicry_wide": fishing(0.2, 0.4), "sagg_riac_wide": fishing(0.1, 0.7)}
+    found |= {"sgim_d_human": algorithm(0.1), "sgim_d_robot": algorithm(0.12)}
+    claims = script.claims_of_fishing(found)
+    assert verdicts(claims, "a") == [True, True, False, False] and verdicts(claims, "b") == [True]
+
+    def at_table(error, tune, **changes):
+        made = algorithm(error, **changes)
+        made["errors"] |= {"tune": [[x * tune for x in (2.0, 2.0, 2.02, 1.98)]] * 2, "burst": [[error] * 4] * 2}
+        made["tasks"]["touch"] = made["tasks"]["tip"]
+        return made | {"steps": [10_000, 25_000]}
+
+    found = {"sgim_pb": at_table(0.1, 0.1), "sgim_acts": at_table(0.12, 0.05), "im_pb_small": at_table(0.2, 0.4)}
+    found["im_pb_taught"] = at_table(0.2, 0.2)
+    claims = script.claims_of_table(found)
+    assert verdicts(claims, "f") == [True, False] and verdicts(claims, "transfer") == [True]
+    assert {claim.row for claim in claims} == {*"fghij", "transfer"} and "at 10,000" in claims[-1].text
+
+
+def test_what_a_learner_can_do_becomes_a_teacher_of_others(tmp_path, monkeypatch):
+    script = load("results/saht")
+    made = []
+    monkeypatch.setattr(script, "trained", lambda world, name, options: made.append(name))
+
+    def record(command, **_):
+        pairs = np.array([[-1, -1], [0, 1], [1, 1]] * 20)
+        tasks = np.array(["blue", "tune", "blue"] * 20)
+        np.savez(command[command.index("--out") + 1], format=1, tasks=tasks, pairs=pairs, sequences=np.arange(60.0))
+
+    monkeypatch.setattr(script.subprocess, "run", record)
+    options = SimpleNamespace(runs=tmp_path, noise=0.0)
+    (tmp_path / "table").mkdir()
+    teachers = script.learnt("table", "im_pb_taught", options)
+    assert made == ["sgim_pb"] and [(one["kind"], one["task"]) for one in teachers] == [
+        ("procedure", "tune"),
+        ("procedure", "blue"),
+    ]
+    with np.load(teachers[0]["source"]) as kept:
+        assert (kept["pairs"] >= 0).all() and len(kept["tasks"]) == 40 and kept["format"] == 1
+    assert len(script.learnt("table", "sgim_d_robot", options)) == 4
+    with np.load(tmp_path / "table" / "sgim_d_robot.npz") as kept:
+        assert len(kept["tasks"]) == 25
+
+
 def test_an_interval_that_reaches_zero_is_no_difference():
     script = load("results/saht")
     one, other = np.array([0.1, 0.3, 0.2, 0.2]), np.array([0.3, 0.2, 0.2, 0.2])
@@ -90,7 +161,7 @@ def test_what_runs_have_left_becomes_tables_and_a_picture(tmp_path, monkeypatch)
         run.mkdir(parents=True)
         assert command[3:] == [
             "train", "saht/sgim_acts", "--world.name", "throw", "--seeds", "2", "--total-env-steps", "1000",
-            "--trainer.checkpoint_every", "1000", "--run-dir", str(run), "--quiet",
+            "--trainer.checkpoint_every", "1000", "--trainer.eval_every", "1", "--run-dir", str(run), "--quiet",
         ]  # fmt: skip
         teachers = "[{kind: action, task: placed, name: action_placed}]"
         text = f"experiment: saht\nworld: {{name: throw}}\nsaht: {{teachers: {teachers}}}\n"
@@ -98,7 +169,8 @@ def test_what_runs_have_left_becomes_tables_and_a_picture(tmp_path, monkeypatch)
         names = ("actions", "action_placed")
         rows = [
             {"seed": seed, "env_steps": step, "wall_s": 1.0, "env_steps_per_s": 9, "eval/error": 0.2 + 0.1 * seed}
-            | {f"eval/error_{task}": 0.2 for task in ("thrown", "placed")}
+            | {f"eval/{key}_{task}": 0.2 for task in ("thrown", "placed") for key in ("error", "area")}
+            | {"saht/asked": 100 * (1 + seed)}
             | {f"saht/task_{task}": 0.5 for task in ("thrown", "placed")}
             | {f"saht/strategy_{name}": 0.25 + 0.5 * i for i, name in enumerate(names)}
             for step in (500, 1000)
@@ -117,6 +189,7 @@ def test_what_runs_have_left_becomes_tables_and_a_picture(tmp_path, monkeypatch)
     told = json.loads((tmp_path / "throw.json").read_text())
     found = told["algorithms"]["sgim_acts"]
     assert found["errors"]["mean"][-1] == [0.2, 0.3] and found["requests"][0] == [0.75, 0.75]
+    assert found["asked"] == [[100, 200], [200, 400]] and found["areas"][0] == [0.2, 0.2]
     assert found["ways"] == ["actions", "action_placed"] and found["commit"] == "abc"
     own = [claim["value"] for claim in told["claims"] if claim["row"] == "c"]
     assert own == [0.0, 1.0]  # thrown has no teacher
@@ -126,9 +199,8 @@ def test_what_runs_have_left_becomes_tables_and_a_picture(tmp_path, monkeypatch)
     shutil.rmtree(Path(run))
 
 
-@pytest.mark.parametrize("world", ["pen", "throw"])
+@pytest.mark.parametrize("world", sorted(path.stem for path in (ROOT / "results" / "saht").glob("*.md")))
 def test_the_page_shows_the_tables_that_were_measured(world):
-    root = Path(__file__).parents[2]
-    page = (root / "docs" / "saht.md").read_text(encoding="utf-8")
-    lines = (root / "results" / "saht" / f"{world}.md").read_text(encoding="utf-8").splitlines()
+    page = (ROOT / "docs" / "saht.md").read_text(encoding="utf-8")
+    lines = (ROOT / "results" / "saht" / f"{world}.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) > 10 and [line for line in lines if line not in page] == []

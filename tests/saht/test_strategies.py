@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from envs import worlds
-from star.saht import loop, memory, strategies, teachers
+from star.saht import loop, memory, proposals, strategies, teachers
 from star.saht.memory import FAR, scale_of
+from star.saht.proposals import Dice, Order, Setting, Way
 from star.saht.sections import TeacherConfig
-from star.saht.strategies import Dice, Order, Setting, Way
 
 PEN = worlds.make("pen")
 SCALE = scale_of(PEN)
@@ -51,7 +51,7 @@ def skilled():
     known, row = memory.empty(PEN, 200), 0
     for task in (TIP, STICK_1, STICK_2):
         sequences, lengths = PEN.demonstrate(task, PEN.benchmark(task)[:60])
-        plain = strategies._plain((sequences, lengths))
+        plain = proposals.plain((sequences, lengths))
         found, _ = loop.execute(SimpleNamespace(world=PEN, scale=SCALE), plain, key=jax.random.key(0))
         known, row = memory.write(known, jnp.int32(row), found), row + 60
     return known, row
@@ -145,7 +145,7 @@ def test_procedures_that_reached_a_goal_are_made_again_for_goals_near_it(skilled
 
 def test_what_does_not_fit_into_a_sequence_is_not_made(chosen, propose):
     """Two sequences of the character's, of four primitives each, make none: then anything is tried."""
-    taught = strategies._plain(PEN.demonstrate(CHARACTER, PEN.benchmark(CHARACTER)[:60]))
+    taught = proposals.plain(PEN.demonstrate(CHARACTER, PEN.benchmark(CHARACTER)[:60]))
     found, _ = loop.execute(chosen, taught, key=jax.random.key(0))
     full = memory.write(memory.empty(PEN, 200), jnp.int32(0), found)
     made = propose(full, 60, order(CHARACTER, jnp.zeros(4), PROCEDURES), jax.random.key(0))

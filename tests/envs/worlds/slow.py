@@ -158,3 +158,113 @@ def throw(primitive):
     elif speed <= 0.6 and abs(z - 0.3) < 0.06 and abs(r) > 0.2:
         value[1, :2], reached[1] = r * heading / 1.1, True
     return value, reached
+
+
+def rotation(axis, angle):
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]] if axis == "z" else [[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def six_joints(angles, shoulder, links, hand):
+    """The tip of an arm whose joints turn about z, y, y, z, y, z."""
+    frame, place = np.eye(3), np.array([0.0, 0.0, shoulder])
+    steps = zip(
+        "zyyzyz", angles, ((0, 0, 0), (0, 0, links[0]), (0, 0, links[1]), (0, 0, 0), (0, 0, 0), hand), strict=True
+    )
+    for axis, angle, then in steps:
+        frame = frame @ rotation(axis, angle)
+        place = place + frame @ np.array(then, float)
+    return place
+
+
+def fishing(primitives):
+    """Where each float meets the water (x, y over 2.2 m), or NaN. In steps of 1.25 ms; tensions one after the other."""
+    primitives, dt = np.asarray(primitives, float), 1.25e-3
+    n, limits = len(primitives), np.array([0.96, 0.72, 0.72, 0.96, 0.72, 0.96])
+    rest, inverse = np.array([0.0, -0.3, 0.8, 0.0, 0.2, 0.0]), [0.0, 1.0, 1 / 6]
+
+    def tip(primitive, time):
+        u = min(time / (1.05 + 0.45 * primitive[24]), 1.0)
+        bumps = [math.comb(4, k) * u**k * (1 - u) ** (4 - k) for k in range(1, 5)]
+        angles = rest + limits * (primitive[:24].reshape(6, 4) @ bumps)
+        return six_joints(angles, 0.45, (0.3, 0.3), (0.15, 0.0, 0.8))
+
+    anchor = np.array([tip(primitive, 0.0) for primitive in primitives])
+    masses, speeds = [anchor - [0, 0, 0.5], anchor - [0, 0, 1.0]], [np.zeros((n, 3))] * 2
+    landed, length = np.full((n, 2), np.nan), lambda way: np.linalg.norm(way, axis=1)[:, None]
+    for step in range(1, 1601):
+        before, old = [anchor, *masses], masses
+        anchor = np.array([tip(primitive, step * dt) for primitive in primitives])
+        now = [anchor]
+        falls = [v + dt * np.array([0, 0, -9.81]) for v in speeds]
+        now += [x + dt * v * (1 - 1.0 * dt) for x, v in zip(masses, falls, strict=True)]
+        ways = []
+        for i in range(2):
+            last, free = before[i + 1] - before[i], now[i + 1] - now[i]
+            way = np.where(length(last) > 0.4995, last, free)
+            ways.append(way / length(way))
+        tension = [np.zeros((n, 1))] * 2
+        for i in [0, 1] * 12:
+            gap = now[i + 1] - now[i]
+            slope = (inverse[i] + inverse[i + 1]) * (gap * ways[i]).sum(axis=1, keepdims=True) / length(gap)
+            pull = np.maximum((length(gap) - 0.5) / slope, -tension[i])
+            tension[i] = tension[i] + pull
+            now[i], now[i + 1] = now[i] + inverse[i] * pull * ways[i], now[i + 1] - inverse[i + 1] * pull * ways[i]
+        masses = now[1:]
+        speeds = [(x - y) / dt for x, y in zip(masses, old, strict=True)]
+        first = (masses[1][:, 2] <= 0) & np.isnan(landed[:, 0])
+        share = old[1][first, 2:] / (old[1][first, 2:] - masses[1][first, 2:])
+        landed[first] = (old[1][first] + share * (masses[1][first] - old[1][first]))[:, :2] / 2.2
+    return landed
+
+
+def table(sequence, length):
+    """(value [6, 4], reached [6], the tips), each primitive ending where its DMPs come to."""
+    rest, limits = np.array([0, 0.5, 1.2, 0, 0.7, 0]), np.array([0.9, 0.7, 0.9, 0.8, 0.8, 0.8])
+    numbers, angles, tips = np.asarray(sequence, float).reshape(-1, 6, 3), rest.copy(), []
+    places, hand, put, found = {"blue": (0.45, 0.2), "green": (0.45, -0.2)}, None, set(), {}
+    for primitive in numbers[:length]:
+        angles = dmp_end(angles, rest + limits * primitive[:, 2], limits[:, None] * primitive[:, :2])
+        tip = six_joints(angles, 0.15, (0.35, 0.35), (0, 0, 0.15))
+        tips.append(tip)
+        x, y, z = tip
+        if not (-0.3 < z <= 0 and 0.2 <= x <= 0.8 and -0.45 <= y <= 0.45):
+            continue
+        found[0] = (x, y)
+        if hand:
+            places[hand], hand = (x, y), put.add(hand)
+            if len(put) == 2:
+                (x1, y1), (x2, y2) = places.values()
+                found[3] = (math.hypot(x1 - x2, y1 - y2), math.atan2(abs(y1 - y2), abs(x1 - x2)) * 2 / math.pi)
+            continue
+        near = [name for name, (u, v) in places.items() if math.hypot(u - x, v - y) < 0.07]
+        if near:
+            hand = near[0]
+        elif -0.45 <= y <= -0.35:
+            found[4] = (x,)
+            if 3 in found:
+                found[5] = (*found[3], x)
+    found |= {task: places[name] for task, name in ((1, "blue"), (2, "green")) if name in put}
+    value, reached = np.zeros((6, 4)), np.zeros(6, bool)
+    for task, one in found.items():
+        value[task, : len(one)], reached[task] = one, True
+    return value, reached, np.array(tips)
+
+
+def dmp_end(start, goal, weights):
+    """Where a movement with two weights a joint ends; pushes are scaled as in `bumps`. Linear, so a sum of four."""
+    ends = unit_ends()
+    return ends[0] * start + ends[1] * goal + weights @ ends[2:]
+
+
+@cache
+def unit_ends():
+    """Of 300 steps of Euler's rule, from 1 to 0, from 0 to 1, and with either push."""
+    x, speed, phase, path = np.array([1.0, 0, 0, 0]), np.zeros(4), 1.0, []
+    for _ in range(300):
+        heights = np.array([math.exp(-3 / c * (phase - c) ** 2) for c in (1.0, math.exp(-4.6))])
+        push = np.concatenate([[0, 0], heights * phase / heights.sum()])
+        pull = 150 * (np.array([0, 1, 0, 0]) - x) - 2 * math.sqrt(150) * speed + push
+        x, speed, phase = x + speed / 300, speed + pull / 300, phase - 4.6 * phase / 300
+        path.append(x)
+    return np.concatenate([x[:2], 0.35 * x[2:] / np.abs(path).max(axis=0)[2:]])

@@ -79,7 +79,7 @@ def here(monkeypatch):
 
 
 def test_a_world_is_found_by_its_name_or_that_of_its_function():
-    assert worlds.names() == ("pen", "throw")
+    assert worlds.names() == ("pen", "throw", "fishing", "table")
     assert [worlds.make(name).name for name in worlds.names()] == list(worlds.names())
     assert worlds.make("adding:make", scale=2.0).longest == 3
 
@@ -87,8 +87,14 @@ def test_a_world_is_found_by_its_name_or_that_of_its_function():
 @pytest.mark.parametrize(
     "name, options, said",
     [
-        ("pne", {}, "world 'pne' is unknown; allowed: pen, throw; did you mean \"pen\"?, or module:name of your own"),
+        (
+            "pne",
+            {},
+            "world 'pne' is unknown; allowed: pen, throw, fishing, table; did you mean \"pen\"?, or module:",
+        ),
         ("pen", {"nose": 1}, 'option "nose" (1) is not one of pen: allowed: noise; did you mean "noise"?'),
+        ("table", {"links": 2}, 'option "links" of table is 2; allowed: a number from 0.8 to 1'),
+        ("throw", {"scale": 2}, 'option "scale" (2) is not one of throw: allowed: noise'),
         ("pen", {"noise": -1}, 'option "noise" of pen is -1; allowed: a number from 0 to 1'),
         ("adding:make", {"noise": "much"}, "option \"noise\" of adding:make is 'much'; allowed: a number from 0 to 1"),
         ("adding:make", {"sale": 1}, 'option "sale" is not one of adding:make; allowed: scale; did you mean "scale"?'),
