@@ -125,7 +125,14 @@ class Row(NamedTuple):
     below: tuple[str, ...] = ()
 
 
+CRL: dict[str, Any] = POINT | {
+    "tutor.period": 30, "tutor.unroll": 1, "commander.period": 30,
+    "controller.crl.hidden": [8], "controller.crl.batch_size": 16, "controller.crl.buffer_size": 480,
+    "controller.crl.min_transitions": 16, "controller.crl.updates_per_rollout": 2,
+}  # fmt: skip
+
 ROWS: dict[str, Row] = {
+    "agents/crl": Row(settings=CRL),
     "agents/flat": Row(),
     "agents/flat_td3": Row(settings=POINT | SMALL_TD3),
     "agents/frugal": Row(settings={key: value for key, value in POINT.items() if key != "tutor.unroll"}),

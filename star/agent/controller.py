@@ -1,7 +1,8 @@
 """The Controller: moves the body towards the subgoal at every env step, wherever it stands.
 
     sees      the state without the abstract position, and the relative subgoal g_t; with `frame` body both turned about
-              z with the body, so that what was learnt in one direction holds in all
+              z with the body, so that what was learnt in one direction holds in all; with `frame` map the whole state
+              and the subgoal's place
     g_{t+1} = s_t + g_t - s_{t+1}                           the subgoal stays where it is while the agent moves
     reward  = -||s_t + g_t - s_{t+1}||  (`distance`, published)   or   ||g_t|| - ||g_{t+1}||  (`progress`)
               less a penalty for the tilt of the body, and one where the task is terminated
@@ -27,7 +28,7 @@ from star import learners
 from star.agent.sections import ControllerConfig
 from star.agent.segments import Policy, Segment
 from star.agent.task import Task
-from star.learners.replay import Imitation, Transition, weighted_mean
+from star.learners.replay import Imitation, Track, Transition, weighted_mean
 from star.sgim.lessons import Shown
 from star.spec import Spec
 
@@ -51,8 +52,14 @@ def example(section: ControllerConfig, task: Task) -> Transition:
         terminated=scalar,
         cut=scalar,
         weight=scalar,
-        extras=jnp.zeros((2, len(spec.scale))) if section.hindsight else (),
+        extras=_example_extras(section, spec),
     )
+
+
+def _example_extras(section: ControllerConfig, spec: Spec) -> Any:
+    if section.settings.futures:
+        return Track(jnp.zeros(len(spec.abstract_indices)), jnp.zeros(()), jnp.zeros(()))
+    return jnp.zeros((2, len(spec.scale))) if section.hindsight else ()
 
 
 def observe(
@@ -60,8 +67,12 @@ def observe(
 ) -> Float[Array, "*batch seen"]:
     """The state without its abstract coordinates, followed by the relative subgoal, both in the axes of `frame`.
 
-    What a full state holds of blocks stays in the world's axes.
+    What a full state holds of blocks stays in the world's axes. With `frame` map it is the whole state and the place of
+    the subgoal's middle.
     """
+    if section.frame == "map":
+        place = task.spec.abstract(state)
+        return jnp.concatenate([state, place + task.subgoals.middle(subgoal)[..., : place.shape[-1]]], axis=-1)
     if section.frame == "body":
         state, subgoal = task.spec.turned(state, task.subgoals.ways(subgoal))
     kept = np.setdiff1d(np.arange(state.shape[-1]), np.asarray(task.spec.abstract_indices, int))
@@ -99,7 +110,7 @@ def experience(
         terminated=segment.terminated,
         cut=jnp.maximum(last, segment.ended),
         weight=segment.alive,
-        extras=_later(task, segment) if section.hindsight else (),
+        extras=_extras(section, task, segment, env_steps),
     )
 
 
@@ -143,6 +154,14 @@ def price(
         return lost
     share = section.tilt_start ** jnp.maximum(1.0 - env_steps / section.tilt_steps, 0.0)
     return lost + share * section.tilt_penalty * spec.tilt(next_obs)
+
+
+def _extras(section: ControllerConfig, task: Task, segment: Segment, env_steps: Float[Array, ""] | float) -> Any:
+    """What replay needs beside the transitions."""
+    if section.settings.futures:
+        epoch = jnp.broadcast_to(jnp.asarray(env_steps, jnp.float32), segment.ended.shape)
+        return Track(task.spec.abstract(segment.obs[:-1]), segment.ended, epoch)
+    return _later(task, segment) if section.hindsight else ()
 
 
 def _later(task: Task, segment: Segment) -> Float[Array, "l B 2 p"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -11,7 +11,7 @@ from star.abstraction.sections import AbstractionConfig, ForwardModelConfig, Ref
 from star.config.run import EnvConfig, RunConfig, TrainerConfig
 from star.config.section import Batch, Hidden, Positive, Repeats, Section, setting
 from star.learners import Rollout
-from star.learners.sections import LevelConfig
+from star.learners.sections import BUILT_IN, OF_PLACES, CRLConfig, LevelConfig, one_of
 from star.sgim.sections import SgimConfig
 
 
@@ -141,6 +141,12 @@ class TutorConfig(LevelConfig):
         return self
 
     @model_validator(mode="after")
+    def _futures_are_of_places(self) -> Self:
+        if self.enabled and self.settings.futures:
+            raise ValueError(f"learner: {self.learner} learns to reach places, to which nobody sends a Tutor")
+        return self
+
+    @model_validator(mode="after")
     def _correction_needs_replay(self) -> Self:
         if self.off_policy_correction and not self.settings.replays:
             raise ValueError("off_policy_correction needs learner td3, which replays old subgoals")
@@ -150,6 +156,10 @@ class TutorConfig(LevelConfig):
 class ControllerConfig(LevelConfig):
     """The Controller: drives the joints towards the subgoal."""
 
+    built_in: ClassVar[tuple[str, ...]] = (*BUILT_IN, *OF_PLACES)
+
+    learner: str = one_of(*built_in)
+    crl: CRLConfig = Field(CRLConfig(), description="settings used when learner is crl")
     termination_penalty: float = setting(
         20.0, "This is taken off the reward where the task is terminated, as by a flip.", unit="", ge=0
     )
@@ -160,12 +170,20 @@ class ControllerConfig(LevelConfig):
     tilt_steps: float = setting(
         1e6, "The share of tilt_penalty rises exponentially to 1 over so many env steps.", unit="env steps", gt=0
     )
-    frame: Literal["world", "body"] = setting(
-        "world", "The Controller sees velocity, tilt and subgoal in the world's axes, or in axes turned with the body."
+    frame: Literal["world", "body", "map"] = setting(
+        "world",
+        "The Controller sees velocity, tilt and subgoal in the world's axes, or in axes turned with the body; or the "
+        "whole state, its own place included, and the place of the subgoal.",
     )
     hindsight: bool = setting(
         False, "Half of the replayed transitions get a subgoal that was reached; this needs learner td3."
     )
+
+    @model_validator(mode="after")
+    def _futures_need_places(self) -> Self:
+        if self.settings.futures and self.frame != "map":
+            raise ValueError(f"frame: {self.frame}, but learner {self.learner} needs the places of goals; allowed: map")
+        return self
 
     @model_validator(mode="after")
     def _hindsight_needs_the_axes_of_the_world(self) -> Self:

@@ -35,6 +35,10 @@ class Points(NamedTuple):
         """The subgoal as displacements that can be turned about z."""
         return subgoal
 
+    def middle(self, subgoal: Float[Array, "*batch p"]) -> Float[Array, "*batch p"]:
+        """The point itself."""
+        return subgoal
+
     def asking(self, way: Float[Array, "*batch p"]) -> Float[Array, "*batch p"]:
         """The subgoal that asks for the displacement `way`."""
         return way
@@ -69,8 +73,11 @@ class Boxes(NamedTuple):
 
     def ways(self, subgoal: Float[Array, "*batch m"]) -> Float[Array, "*batch m"]:
         """The nearest point of the box and its centre: turned about z, a box is no box."""
-        centre = sum(jnp.split(subgoal, 2, axis=-1)) / 2
-        return jnp.concatenate([self.nearest(subgoal), centre], axis=-1)
+        return jnp.concatenate([self.nearest(subgoal), self.middle(subgoal)], axis=-1)
+
+    def middle(self, subgoal: Float[Array, "*batch m"]) -> Float[Array, "*batch d"]:
+        """The centre of the box."""
+        return jnp.asarray(sum(jnp.split(subgoal, 2, axis=-1))) / 2
 
     def asking(self, way: Float[Array, "*batch d"]) -> Float[Array, "*batch m"]:
         """The box around where the displacement `way` leads."""

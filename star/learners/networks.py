@@ -59,6 +59,15 @@ def descend(
     return params, optimizer, losses.mean()
 
 
+def adam_step(
+    params: Any, gradient: Any, optimizer: optax.OptState, learning_rate: float | Array, enabled: Array
+) -> tuple[Any, optax.OptState]:
+    """One Adam step, or nothing at all where `enabled` is false."""
+    step, stepped = optax.scale_by_adam().update(gradient, optimizer)
+    params = jax.tree.map(lambda p, s: p - jnp.where(enabled, learning_rate * s, 0.0), params, step)
+    return params, jax.tree.map(lambda new, old: jnp.where(enabled, new, old), stepped, optimizer)
+
+
 class Normalizer(struct.PyTreeNode):
     """Running mean and variance of a vector, by the parallel update of Chan, Golub and LeVeque (1979)."""
 

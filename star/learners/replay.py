@@ -34,6 +34,18 @@ class Transition(struct.PyTreeNode):
     extras: Any = ()
 
 
+class Track(struct.PyTreeNode):
+    """Where the agent was before an env step, and where its way ends: extras of learners that look into the future.
+
+    `over` is 1 where the episode ends with this env step, before its time. `epoch` differs from epoch to epoch: none
+    goes on into the next.
+    """
+
+    place: Float[Array, "*batch k"]
+    over: Float[Array, "*batch"]
+    epoch: Float[Array, "*batch"]
+
+
 class Imitation(struct.PyTreeNode):
     """Actions that were demonstrated, for the actor's mean to come near: mean of weight * ||mean(o) - a||^2 / 2."""
 

@@ -14,6 +14,13 @@ from star.learners.protocol import Learner, LearnerConfig, Rollout
 
 NUMBER = 4  # bytes
 BUILT_IN = ("ppo", "td3")
+OF_PLACES = ("crl",)  # of a level that is sent to places
+
+
+def one_of(*names: str) -> Any:
+    """The setting `learner` of a level that may have one of these, or one from outside."""
+    words = f"{', '.join(names)} or module:name of your own"
+    return setting("ppo", "The level learns by this algorithm.", allowed=words)
 
 
 class PPOConfig(LearnerConfig):
@@ -124,12 +131,57 @@ class TD3Config(BufferedConfig, LearnerConfig):
         return self.updates_per_rollout * self.batch_size / rollout.size
 
 
+class CRLConfig(BufferedConfig, LearnerConfig):
+    """Contrastive reinforcement learning (Eysenbach et al. 2022); defaults are JaxGCRL's."""
+
+    hidden: Hidden = setting(
+        (256, 256), "Actor and both halves of the critic have layers of these widths.", unit="units"
+    )
+    representation: Positive = setting(64, "The halves of the critic meet in a space of this size.", unit="units")
+    learning_rate: float = setting(3e-4, "Adam takes steps of this size.", unit="", gt=0)
+    discount: float = setting(
+        0.99,
+        "Goals lie so many env steps ahead: geometric, each step going on with this probability (gamma).",
+        unit="",
+        gt=0,
+        lt=1,
+    )
+    logsumexp_penalty: float = setting(
+        0.1, "The critic is kept near a probability by a penalty of this weight.", unit="", ge=0
+    )
+    batch_size: Batch = setting(256, "Each update learns from so many transitions.", unit="transitions")
+    buffer_size: Positive = setting(512_000, "The buffer keeps so many transitions.", unit="transitions")
+    min_transitions: Positive = setting(1000, "The first update waits for so many transitions.", unit="transitions")
+    updates_per_rollout: Repeats = setting(10, "Each rollout is followed by so many gradient updates.", unit="updates")
+
+    replays: ClassVar[bool] = True
+    futures: ClassVar[bool] = True
+
+    def check(self, rollout: Rollout) -> None:
+        """The buffer holds whole rollouts, one after the other, and what updates wait for."""
+        if self.buffer_size % rollout.size:
+            raise ValueError(
+                f"buffer_size: {self.buffer_size} is not a multiple of one rollout of {rollout.size} transitions"
+            )
+        if self.buffer_size < self.min_transitions:
+            raise ValueError(f"min_transitions: {self.min_transitions} exceeds buffer_size {self.buffer_size}")
+
+    def scratch_bytes(self, rollout: Rollout) -> int:
+        """What networks keep of a batch to learn from it, and the energies of its pairs."""
+        return self.batch_size * (sum(self.hidden) + self.batch_size) * NUMBER
+
+    def samples_per_transition(self, rollout: Rollout) -> float:
+        """Samples drawn after a rollout, for each transition in it."""
+        return self.updates_per_rollout * self.batch_size / rollout.size
+
+
 class LevelConfig(Section):
     """The common settings of Tutor and Controller: a learner and a reward."""
 
-    learner: str = setting(
-        "ppo", "The level learns by this algorithm.", allowed=f"{', '.join(BUILT_IN)} or module:name of your own"
-    )
+    built_in: ClassVar[tuple[str, ...]] = BUILT_IN
+    """The learners of this package that it may have."""
+
+    learner: str = one_of(*BUILT_IN)
     reward: Literal["distance", "progress"] = setting(
         "progress", "The reward is minus the distance to the target, or how much it decreases."
     )
@@ -151,8 +203,8 @@ class LevelConfig(Section):
     def _learner_exists(cls, name: str) -> str:
         if plugins.is_plugin(name):
             _own(name)
-        elif name not in BUILT_IN:
-            raise ValueError(f"should be {', '.join(map(repr, BUILT_IN))} or 'module:name' of your own")
+        elif name not in cls.built_in:
+            raise ValueError(f"should be {', '.join(map(repr, cls.built_in))} or 'module:name' of your own")
         return name
 
     @field_validator("own", mode="before")

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from star import devices
 from star.learners import replay
-from star.learners.networks import MLP, Normalizer, apply
+from star.learners.networks import MLP, Normalizer, adam_step, apply
 from star.learners.protocol import Learner, whole
 from star.learners.replay import Imitation, Penalty, Relabel, Transition, flatten, weighted_mean
 from star.learners.sections import TD3Config
@@ -164,13 +164,13 @@ def _one_update(
     critic_grad, critic_metrics = jax.grad(partial(_critic_loss, config), has_aux=True)(
         state.params["critic"], state.target, seen, noise_key
     )
-    critic, critic_optimizer = _adam_step(
+    critic, critic_optimizer = adam_step(
         state.params["critic"], critic_grad, state.critic_optimizer, config.critic_learning_rate, ready
     )
     actor_grad, actor_metrics = jax.grad(partial(_actor_loss, config, penalty, imitation), has_aux=True)(
         state.params["actor"], critic, seen, batch
     )
-    actor, actor_optimizer = _adam_step(
+    actor, actor_optimizer = adam_step(
         state.params["actor"], actor_grad, state.actor_optimizer, config.actor_learning_rate, act_too
     )
     params = {"actor": actor, "critic": critic}
@@ -220,15 +220,6 @@ def _actor_loss(
     if imitation is not None:
         loss += imitation.loss(_policy(config, params, imitation.obs, batch.action.shape[-1]))
     return loss, {"actor_loss": loss}
-
-
-def _adam_step(
-    params: Any, gradient: Any, optimizer: optax.OptState, learning_rate: float | Array, enabled: Array
-) -> tuple[Any, optax.OptState]:
-    """One Adam step, or nothing at all where `enabled` is false."""
-    step, stepped = optax.scale_by_adam().update(gradient, optimizer)
-    params = jax.tree.map(lambda p, s: p - jnp.where(enabled, learning_rate * s, 0.0), params, step)
-    return params, jax.tree.map(lambda new, old: jnp.where(enabled, new, old), stepped, optimizer)
 
 
 def _action_size(state: TD3State) -> int:
