@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from envs import arena as arenas
+from envs import layouts
 from envs.arena import BLOCK, CELL_SIZES, CHASM, FREE, GATE, GOAL, ROBOT, Arena
 from envs.options import EnvError, Option, choice, count, duration, number
 from envs.places import Places, Point, anywhere, around, box, centres, point, scaled
@@ -265,26 +266,6 @@ def _refuse(arena: Arena, strange: Mapping[str, str]) -> None:
 
 # The published tasks (star.md of the paper's experiments): 8 m cells, success within 5 m.
 
-MAZE = Arena(rows=("11111", "1r001", "11101", "10001", "11111"), cell=8.0)
-CAM = Arena(rows=("11111", "1r001", "111D1", "10001", "11111"), cell=8.0)
-PUSH = Arena(rows=("11111", "10r11", "10B01", "11011", "11111"), cell=8.0, block="xy")
-FALL = Arena(rows=("1111", "1r01", "10B1", "1##1", "1001", "1111"), cell=8.0, block="yz")
-STOCHASTIC = Arena(rows=("11111", "10r01", "10B01", "10001", "11111"), cell=8.0, block="x")
-SPARSE = Arena(
-    rows=(
-        "1111111111",
-        "1rrrrrrrr1",
-        "1rrrrrrrr1",
-        "1111111rr1",
-        "10rrrrrrr1",
-        "10rrrrrrr1",
-        "1111111rr1",
-        "1rrrrrrrr1",
-        "1rrrrrrrr1",
-        "1111111111",
-    ),
-    cell=2.0,
-)
 MAZE_GOALS = {"train": box((-4.0, -4.0), (20.0, 20.0)), "test": point(0.0, 16.0)}
 CAM_SWITCH = Switch(lower=(16.0, float("-inf")), upper=(20.0, 8.0), yaw=(-1.0, 0.0))
 
@@ -292,7 +273,7 @@ CAM_SWITCH = Switch(lower=(16.0, float("-inf")), upper=(20.0, 8.0), yaw=(-1.0, 0
 FALL_GOALS = {
     "train": point(0.0, 27.0, 4.5),
     "test": point(0.0, 27.0, 4.5),
-    "free": around(FALL, FREE + ROBOT, clearance=3.2, height=(4.5,)),  # nobody in the gap is within 5 m of them
+    "free": around(layouts.FALL, FREE + ROBOT, clearance=3.2, height=(4.5,)),  # nobody in the gap is within 5 m of them
 }
 FALL_GEOMETRY = Geometry(
     goal_indices=(0, 1, 2),
@@ -300,66 +281,6 @@ FALL_GEOMETRY = Geometry(
     space=((-4.0, -4.0, 0.0), (12.0, 28.0, 8.0)),
     region_cuts=((4.0,), (16.0,), ()),
     subgoal_scale=(10.0, 10.0, 0.5),
-)
-
-# The reference names rooms of 4 m cells without showing them. These are ours.
-
-ROOMS_2 = Arena(rows=("111111111", "100010001", "1r0000001", "100010001", "111111111"), cell=4.0)
-ROOMS_3 = Arena(rows=("1111111111111", "1r00100000001", "1000100010001", "10000000100g1", "1111111111111"), cell=4.0)
-ROOMS_4 = Arena(
-    rows=(
-        "111111111",
-        "1r0010001",
-        "100000001",
-        "100010001",
-        "110111011",
-        "100010001",
-        "100000001",
-        "1000100g1",
-        "111111111",
-    ),
-    cell=4.0,
-)
-
-
-def _transposed(*rows: str) -> tuple[str, ...]:
-    return tuple("".join(column) for column in zip(*rows, strict=True))
-
-
-# JaxGCRL's mazes, whose first index is x: 4 m cells, success within .5 m, goals at the centres of the cells `g`.
-# U4 and U5 are of a later paper with its environments (Wang et al. 2025).
-
-U_MAZE = Arena(_transposed("11111", "1rgg1", "111g1", "1ggg1", "11111"), cell=4.0)
-U_MAZE_TEST = Arena(_transposed("11111", "1r001", "11101", "1ggg1", "11111"), cell=4.0)
-U4_MAZE = Arena(_transposed("11111", "1ggg1", "1r1g1", "111g1", "1g1g1", "1ggg1", "11111"), cell=4.0)
-U4_MAZE_TEST = Arena(_transposed("11111", "10001", "1r101", "11101", "1g101", "1ggg1", "11111"), cell=4.0)
-U5_MAZE = Arena(
-    _transposed("11111111", "1gggggg1", "1r1111g1", "111111g1", "1g1111g1", "1gggggg1", "11111111"), cell=4.0
-)
-U5_MAZE_TEST = Arena(
-    _transposed("11111111", "10000001", "1r111101", "11111101", "1g1111g1", "1gggggg1", "11111111"), cell=4.0
-)
-BIG_MAZE = Arena(
-    _transposed("11111111", "1rg11gg1", "1gg1ggg1", "11ggg111", "1gg1ggg1", "1g1gg1g1", "1ggg1gg1", "11111111"),
-    cell=4.0,
-)
-BIG_MAZE_TEST = Arena(
-    _transposed("11111111", "1r011gg1", "10010gg1", "11000111", "10010001", "101g01g1", "10gg1gg1", "11111111"),
-    cell=4.0,
-)
-HARDEST_MAZE = Arena(
-    _transposed(
-        "111111111111",
-        "1rggg1ggggg1",
-        "1g11g1g1g1g1",
-        "1gggggg1ggg1",
-        "1g1111g111g1",
-        "1gg1g1ggggg1",
-        "11g1g1g1g111",
-        "1gg1ggg1ggg1",
-        "111111111111",
-    ),
-    cell=4.0,
 )
 
 
@@ -373,27 +294,32 @@ def _both(body: str) -> dict[str, Task]:
     """The tasks that make sense for any body."""
     sparse = {"train": point(2.0, 9.0), "test": point(2.0, 9.0)}
     return {
-        f"{body}_maze": maze(body, MAZE, goals=MAZE_GOALS, maps=True),
-        f"{body}_maze_cam": maze(body, CAM, goals=MAZE_GOALS, switch=CAM_SWITCH),
-        f"{body}_maze_sparse": maze(body, SPARSE, success_radius=1.0, goals=sparse, defaults={"reward": "sparse"}),
-        f"{body}_2rooms": maze(body, ROOMS_2),
-        f"{body}_3rooms": maze(body, ROOMS_3),
-        f"{body}_4rooms": maze(body, ROOMS_4),
-        f"{body}_u_maze": _jaxgcrl(body, U_MAZE, U_MAZE_TEST),
-        f"{body}_u4_maze": _jaxgcrl(body, U4_MAZE, U4_MAZE_TEST),
-        f"{body}_u5_maze": _jaxgcrl(body, U5_MAZE, U5_MAZE_TEST),
-        f"{body}_big_maze": _jaxgcrl(body, BIG_MAZE, BIG_MAZE_TEST),
-        f"{body}_hardest_maze": _jaxgcrl(body, HARDEST_MAZE, HARDEST_MAZE),
+        f"{body}_maze": maze(body, layouts.MAZE, goals=MAZE_GOALS, maps=True),
+        f"{body}_maze_cam": maze(body, layouts.CAM, goals=MAZE_GOALS, switch=CAM_SWITCH),
+        f"{body}_maze_sparse": maze(
+            body, layouts.SPARSE, success_radius=1.0, goals=sparse, defaults={"reward": "sparse"}
+        ),
+        f"{body}_2rooms": maze(body, layouts.ROOMS_2),
+        f"{body}_3rooms": maze(body, layouts.ROOMS_3),
+        f"{body}_4rooms": maze(body, layouts.ROOMS_4),
+        f"{body}_u_maze": _jaxgcrl(body, layouts.U_MAZE, layouts.U_MAZE_TEST),
+        f"{body}_u4_maze": _jaxgcrl(body, layouts.U4_MAZE, layouts.U4_MAZE_TEST),
+        f"{body}_u5_maze": _jaxgcrl(body, layouts.U5_MAZE, layouts.U5_MAZE_TEST),
+        f"{body}_big_maze": _jaxgcrl(body, layouts.BIG_MAZE, layouts.BIG_MAZE_TEST),
+        f"{body}_hardest_maze": _jaxgcrl(body, layouts.HARDEST_MAZE, layouts.HARDEST_MAZE),
     }
 
 
 TASKS: Mapping[str, Task] = {
     **_both("point"),
     **_both("ant"),
-    "ant_push": maze("ant", PUSH, goals={"train": point(0.0, 19.0), "test": point(0.0, 19.0)}),
-    "ant_fall": maze("ant", FALL, geometry=FALL_GEOMETRY, goals=FALL_GOALS),
+    "ant_push": maze("ant", layouts.PUSH, goals={"train": point(0.0, 19.0), "test": point(0.0, 19.0)}),
+    "ant_fall": maze("ant", layouts.FALL, geometry=FALL_GEOMETRY, goals=FALL_GOALS),
     "ant_maze_stochastic": maze(
-        "ant", STOCHASTIC, goals={"train": box((-12.0, -4.0), (12.0, 20.0)), "test": point(0.0, 16.0)}, block_noise=1.0
+        "ant",
+        layouts.STOCHASTIC,
+        goals={"train": box((-12.0, -4.0), (12.0, 20.0)), "test": point(0.0, 16.0)},
+        block_noise=1.0,
     ),
 }
 

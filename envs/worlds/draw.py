@@ -109,7 +109,7 @@ def figure_of(height: int, aspect: float) -> Any:
 
 
 def pixels(figure: Any) -> np.ndarray:
-    """What is drawn on it: uint8 [height, width, 3]."""
+    """Its picture: uint8 [height, width, 3]."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(figure)

@@ -73,7 +73,7 @@ def _angles(numbers: Float[Array, "25"]) -> Float[Array, "6 steps"]:
 
 
 def _landing(float_: Float[Array, "3 steps"]) -> tuple[Float[Array, "2"], Int[Array, ""], Bool[Array, ""]]:
-    """Where the float first meets the water, the number of the time by which it has, and whether it does at all."""
+    """The place where the float first meets the water, the number of that moment, and True if it does at all."""
     under = float_[2] <= 0
     wet = under.any()
     after = jnp.maximum(jnp.argmax(under), 1)

@@ -36,7 +36,7 @@ NEAR = 2 * RADIUS
 
 
 class Room(NamedTuple):
-    """What is in a room besides the robot."""
+    """The contents of a room besides the robot."""
 
     movable: int = 2
     fixed: int = 1
@@ -80,7 +80,7 @@ class Room(NamedTuple):
 
 
 class RoomState(struct.PyTreeNode):
-    """Where all is."""
+    """The places of all things."""
 
     places: Float[Array, "D 2"]
     colours: Float[Array, "D-1 2"]

@@ -53,7 +53,7 @@ def swing(tip: Float[Array, "3 steps"]) -> Float[Array, "2 3 steps"]:
 
 
 def _direction(before: Vector, after: Vector) -> Vector:
-    """That in which a stretch pulls."""
+    """The direction in which a stretch pulls."""
     taut = _length(before) > LENGTH / 2 * (1 - TAUT)
     old, new = _unit(before), _unit(after)
     return (jnp.where(taut, old[0], new[0]), jnp.where(taut, old[1], new[1]), jnp.where(taut, old[2], new[2]))

@@ -47,7 +47,7 @@ MIDDLES = ((0.45, 0.1), (0.55, 0.1), (0.35, 0.1), (0.45, 0.0), (0.55, 0.0))  # m
 
 
 class Hand(IntEnum):
-    """What can be in the hand."""
+    """The things that can be in the hand."""
 
     NOTHING, BLUE, GREEN = range(3)
 
@@ -81,7 +81,7 @@ class Seen(NamedTuple):
     """Of blue and green."""
     hand: Int[Array, ""]
     put: Bool[Array, "2"]
-    """Whether each was ever put down."""
+    """True for each that was ever put down."""
     burst: tuple[Float[Array, "2"], Bool[Array, ""]]
     touch: tuple[Float[Array, "2"], Bool[Array, ""]]
     rhythm: tuple[Float[Array, "1"], Bool[Array, ""]]
@@ -94,11 +94,11 @@ class Path(NamedTuple):
     arm: Float[Array, "steps 3 3"]
     """Elbow, wrist and tip in m."""
     objects: Float[Array, "steps 2 2"]
-    """Where blue and green lie, or were taken."""
+    """The places where blue and green lie, or were taken."""
     hand: Int[Array, "steps"]
     """One of `Hand`."""
     sounds: Bool[Array, "steps 2"]
-    """Whether there was a burst, and a rhythm."""
+    """True for a burst, and for a rhythm."""
 
 
 def simulate(body: Body, sequence: Float[Array, "L p"], length: Int[Array, ""]) -> tuple[Outcomes, Path]:
@@ -141,7 +141,7 @@ def _commands(body: Body, sequence: Array) -> tuple[Float[Array, "6 6"], Float[A
 
 
 def _touched(seen: Seen, tip: Float[Array, "3"], active: Bool[Array, ""]) -> Seen:
-    """What a primitive that ends at `tip` leads to."""
+    """The effect of a primitive that ends at `tip`."""
     place, lower, upper = tip[:2], jnp.array(LOWER), jnp.array(UPPER)
     touch = active & (tip[2] > LOWEST) & (tip[2] <= 0) & (place >= lower).all() & (place <= upper).all()
     empty = seen.hand == Hand.NOTHING
@@ -175,7 +175,7 @@ def _burst(places: Float[Array, "2 2"]) -> Float[Array, "2"]:
 
 
 def _path(body: Body, starts: Array, goals: Array, weights: Array, every: list[Seen], length: Array) -> Path:
-    """What is there after each control step; after the last primitive all stays."""
+    """The state after each control step; after the last primitive all stays."""
     basis = jnp.asarray(dmp.curves(STEPS, WEIGHTS), jnp.float32)
     moved = jax.vmap(partial(dmp.rollout, basis))(starts[:-1], goals, weights)  # [L, 6, steps]
     still = (jnp.arange(LONGEST) >= length)[:, None, None]
@@ -281,7 +281,7 @@ def _goals(body: Body, task: int) -> Float[np.ndarray, "n d"]:
 
 
 def _free(objects: Float[np.ndarray, "n 2"], place: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "n"]:
-    """Whether a touch at a place takes none of the objects."""
+    """True if a touch at a place takes none of the objects."""
     return np.linalg.norm(objects - place, axis=1) > RADIUS
 
 

@@ -168,7 +168,7 @@ def check_throw(number: int) -> dict[str, list[float]]:
 
 
 def _fall(simulator: mujoco.MjModel, data: mujoco.MjData, place: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Where a ball comes down that is let go."""
+    """The place at which a ball comes down that is let go."""
     data.qpos[4:7], data.qvel[4:7] = place, speed
     while data.qpos[6] > 0:
         before = data.qpos[4:7].copy()
@@ -177,7 +177,7 @@ def _fall(simulator: mujoco.MjModel, data: mujoco.MjData, place: np.ndarray, spe
 
 
 def _through(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Where a way crosses z = 0."""
+    """The place at which a way crosses z = 0."""
     return (before + (after - before) * before[2] / (before[2] - after[2]))[:2]
 
 
@@ -190,7 +190,7 @@ def check_fishing(number: int) -> dict[str, list[float]]:
 
 
 def fishing_apart(sequences: np.ndarray, seen: Any) -> dict[str, list[float]]:
-    """How far these movements [n, 1, 25], whose traces are `seen`, are from those of a rod and a line of two masses."""
+    """Distances of movements [n, 1, 25], whose traces are `seen`, from those of a rod and a line of two masses."""
     half = rope.LENGTH / 2
     masses = "".join(_mass(name, mass) for name, mass in (("middle", GRAIN), ("float", GRAIN / rope.SHARE)))
     ends = (("tip", "middle"), ("middle", "float"))
@@ -283,7 +283,7 @@ CHECKS: dict[str, Callable[[int], dict[str, list[float]]]] = {
 
 
 def rows(name: str, number: int) -> list[dict[str, Any]]:
-    """What is told of a world."""
+    """The report on a world."""
     began = time.monotonic()
     found = CHECKS[name](number)
     seconds = round(time.monotonic() - began, 1)

@@ -39,12 +39,12 @@ from star.training.journal import Journal, by_step
 
 NAMES = ("room", "given", "random")
 KINDS = ("position", "wall", "push")
-FIGURES = ("births", "competence", "hierarchy", "curriculum", "summary")
+FIGURES = ("births", "competence", "hierarchy", "curriculum")
 MOST_SECONDS = 1200
 
 
 def trained(name: str, options: argparse.Namespace) -> dict[str, Any]:
-    """What a run has measured; it is made, or gone on with, if need be."""
+    """Measurements of a run, which is made or goes on if need be."""
     run = options.runs / name
     words = [f"chime/{name}", "--seeds", str(options.seeds), "--total-env-steps", str(options.total)]
     rows = Journal.of(run, tables="models").metrics.read() if run.exists() else []

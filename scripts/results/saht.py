@@ -93,7 +93,7 @@ ALGORITHMS: Mapping[str, list[str]] = {
 IMITATORS = ("sgim_acts", "sgim_acts_many", "dagger", "cba")
 """Those that are compared by what they ask."""
 LEARNT = {"sgim_d_robot": "sagg_riac", "im_pb_taught": "sgim_pb"}
-"""Who is taught by what another has learnt."""
+"""Learners that are taught by the finds of another."""
 OF_WORLD = {
     "pen": ("sgim_pb", "sgim_acts", "im_pb", "sagg_riac", "random", "sgim_pb_even", "sgim_acts_even", "im_pb_even")
     + ("sgim_d", "mimicry"),

@@ -157,7 +157,7 @@ def price(
 
 
 def _extras(section: ControllerConfig, task: Task, segment: Segment, env_steps: Float[Array, ""] | float) -> Any:
-    """What replay needs beside the transitions."""
+    """The extras of transitions, which replay needs."""
     if section.settings.futures:
         epoch = jnp.broadcast_to(jnp.asarray(env_steps, jnp.float32), segment.ended.shape)
         return Track(task.spec.abstract(segment.obs[:-1]), segment.ended, epoch)

@@ -172,8 +172,7 @@ class ControllerConfig(LevelConfig):
     )
     frame: Literal["world", "body", "map"] = setting(
         "world",
-        "The Controller sees velocity, tilt and subgoal in the world's axes, or in axes turned with the body; or the "
-        "whole state, its own place included, and the place of the subgoal.",
+        "The Controller sees subgoals in the axes of the world or of its body, or the whole state and places on the map.",
     )
     hindsight: bool = setting(
         False, "Half of the replayed transitions get a subgoal that was reached; this needs learner td3."

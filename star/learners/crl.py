@@ -38,7 +38,7 @@ _LEAST = 1e-6
 
 
 class Step(struct.PyTreeNode):
-    """What is kept of an env step: what was seen and done, where the agent was, and what follows it."""
+    """An env step in the buffer: observation, action, and the agent's track."""
 
     obs: Float[Array, "*batch obs"]
     action: Float[Array, "*batch act"]
@@ -131,7 +131,7 @@ def update(
 
 
 def steps_left(ring: replay.Ring, *, num_envs: int) -> Int[Array, "size"]:
-    """How many of the steps that follow each item of `ring` are in it and of the same episode.
+    """The number of steps that follow each item of `ring`, in it and of the same episode.
 
     Items are those of rollouts of `num_envs` environments, so that the next step of an environment is `num_envs` ahead.
     """

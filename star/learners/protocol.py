@@ -32,7 +32,7 @@ class LearnerConfig(Section):
     """True if old transitions are learnt from again; `update` then takes `relabel`."""
 
     futures: ClassVar[bool] = False
-    """Whether goals are drawn from the future. Then `extras` are a `Track`, and observations end in the goal."""
+    """True if goals are drawn from the future. Then `extras` are a `Track`, and observations end in the goal."""
 
     def check(self, rollout: Rollout) -> None:
         """Raise ValueError in one line, beginning with the setting, if such rollouts cannot be learnt from."""

@@ -35,7 +35,7 @@ class Transition(struct.PyTreeNode):
 
 
 class Track(struct.PyTreeNode):
-    """Where the agent was before an env step, and where its way ends: extras of learners that look into the future.
+    """The agent's place before an env step, and the end of its way: extras of learners that look into the future.
 
     `over` is 1 where the episode ends with this env step, before its time. `epoch` differs from epoch to epoch: none
     goes on into the next.

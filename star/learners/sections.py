@@ -167,7 +167,7 @@ class CRLConfig(BufferedConfig, LearnerConfig):
             raise ValueError(f"min_transitions: {self.min_transitions} exceeds buffer_size {self.buffer_size}")
 
     def scratch_bytes(self, rollout: Rollout) -> int:
-        """What networks keep of a batch to learn from it, and the energies of its pairs."""
+        """Activations of a batch in the networks, and the energies of its pairs."""
         return self.batch_size * (sum(self.hidden) + self.batch_size) * NUMBER
 
     def samples_per_transition(self, rollout: Rollout) -> float:

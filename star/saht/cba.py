@@ -41,7 +41,7 @@ def propose(setting: Setting, memory: Memory, rows: Array, order: Order, dice: D
 
 
 def confident(memory: Memory, near: Neighbours, dims: Array) -> Bool[Array, ""]:
-    """Whether the neighbours of a goal of so many dimensions are near enough and agree."""
+    """True if the neighbours of a goal of so many dimensions are near enough and agree."""
     apart = jnp.linalg.norm(near.outcomes[:, None] - near.outcomes, axis=-1)
     apart = jnp.where(near.known & ~jnp.eye(len(apart), dtype=bool), apart, FAR).min(axis=1)
     several = near.known & (apart < FAR / 2)
@@ -53,7 +53,7 @@ def confident(memory: Memory, near: Neighbours, dims: Array) -> Bool[Array, ""]:
 def mistaken(
     setting: Setting, sequences: Array, lengths: Array, task: Array, wanted: Float[Array, "G 4"], *, key: Array
 ) -> Bool[Array, "G"]:
-    """Which of them miss their goals, as the teacher sees when they are executed."""
+    """True for those that miss their goals, as the teacher sees when they are executed."""
     found = setting.world.execute(sequences, lengths, key=key)
     value = setting.scale.scaled(found.value)[:, task]
     return ~found.reached[:, task] | (jnp.linalg.norm(value - wanted, axis=-1) > SKILFUL)

@@ -5,8 +5,8 @@
 
 So half of all iterations are the teacher's: beta_i is 1 for i = 1, and then 0. Source: Ross, Gordon and Bagnell, A
 Reduction of Imitation Learning and Structured Prediction to No-Regret Online Learning (AISTATS 2011, arXiv 1011.0686),
-Algorithm 3.1. What it visits are states, here goals; its policy knows the teacher's actions only, here also what came
-of its own.
+Algorithm 3.1. It visits states, here goals. Its policy knows the teacher's actions only, here also the outcomes of its
+own.
 """
 
 from __future__ import annotations

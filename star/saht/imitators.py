@@ -1,7 +1,7 @@
-"""What strategies of imitation learning share: teachers who are asked about any goal, and a policy that learns of them.
+"""Parts that strategies of imitation learning share: teachers to ask about any goal, and a policy that learns of them.
 
 Their papers have states, actions and a classifier or regressor; a learner here has goals, sequences and the inverse
-model over its memory. What a teacher shows is executed, which is an iteration, and so remembered.
+model over its memory. A demonstration is executed, which is an iteration, and so remembered.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def goals(setting: Setting, order: Order, dice: Dice) -> Float[Array, "G 4"]:
 def policy(
     setting: Setting, memory: Memory, rows: Array, task: Array, wanted: Float[Array, "G 4"], dice: Dice
 ) -> tuple[Float[Array, "G L p"], Int[Array, "G"], Neighbours]:
-    """What the learner does for each goal by the inverse model, anything where nothing is known; and the neighbours."""
+    """Sequences for each goal by the inverse model, anything where nothing is known; and the neighbours."""
     dims = jnp.array(setting.world.dims)[task]
 
     def one(goal: Array) -> tuple[Array, Array, Neighbours]:
@@ -37,7 +37,7 @@ def policy(
 
 
 def shown(setting: Setting, task: Array, wanted: Float[Array, "G 4"]) -> tuple[Float[Array, "G L p"], Int[Array, "G"]]:
-    """What the world's teacher of the task shows for each goal."""
+    """Demonstrations of the world's teacher of the task for each goal."""
     found = setting.world.demonstrate(0, setting.scale.value(0, wanted))
     for number in range(1, len(setting.world.tasks)):
         one = setting.world.demonstrate(number, setting.scale.value(number, wanted))

@@ -40,7 +40,7 @@ def regress(
 
 
 def same_way(memory: Memory, near: Neighbours) -> Bool[Array, "k"]:
-    """Which neighbours have the length of the best one, and do it in the same way: two ways must not be averaged."""
+    """True for neighbours of the best one's length that do it in the same way: two ways must not be averaged."""
     sequences, lengths = memory.sequences[near.rows], memory.lengths[near.rows]
     _, longest, numbers = sequences.shape
     played = (jnp.arange(longest) < lengths[0])[:, None]

@@ -27,7 +27,7 @@ CHUNK, GROUP = 1024, 8  # rows
 FAR = 1e3
 """Distance of what was not reached: no two outcomes within their bounds are farther apart than 1."""
 NEIGHBOURS = 10
-"""How many of the best rows a learner looks at."""
+"""The number of best rows that a learner looks at."""
 GAMMA = 1.2
 """The factor on a rank for one primitive more."""
 OFFSET = 0.01  # of a distance in ranks: an exact outcome of a long sequence still has a rank above 0

@@ -96,7 +96,7 @@ class Dice(NamedTuple):
 
 
 def _parts(draw: Any, key: Array, shapes: Sequence[tuple[int, ...]]) -> list[Array]:
-    """What one call draws, in these shapes."""
+    """The draws of one call, in these shapes."""
     sizes = np.array([math.prod(shape) for shape in shapes])
     parts = jnp.split(draw(key, (int(sizes.sum()),)), np.cumsum(sizes)[:-1])
     return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]

@@ -38,9 +38,9 @@ class Population(struct.PyTreeNode):
     moments: Any
     """Of Adam."""
     active: Bool[Array, "K"]
-    """Which exist."""
+    """True for those that exist."""
     enabled: Bool[Array, "K"]
-    """Which are used: slots alone."""
+    """True for those in use: slots alone."""
     competence: Float[Array, "K"]
     """1 less the error on what was held out, at least 0."""
     born: Int[Array, "K"]
@@ -118,7 +118,7 @@ def possible(
 
 
 def telling(memory: Memory, among: Bool[Array, "N"], outcome: Array, control: Array) -> Float[Array, "E O"]:
-    """How different each possible input is where the outcome moves from where only the control does, for each pair [E].
+    """The use of each possible input for each pair [E]: it tells apart if the outcome moves or the control alone.
 
     The squared distance of the means of an input, or of its square, in units of its variance; 1 for the largest.
     """

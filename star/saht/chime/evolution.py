@@ -137,14 +137,14 @@ def succeed(
 
 
 def changed_for_good(config: ChimeConfig, population: Population, judged: Judged) -> Bool[Array, "K"]:
-    """Which copies are better than their parents by enough, or not worse with an input less."""
+    """True for copies that are better than their parents by enough, or not worse with an input less."""
     inputs = population.models.context.sum(axis=-1)
     fewer = inputs < inputs[jnp.maximum(population.parent, 0)]
     return (population.parent != NOBODY) & (judged.own <= jnp.where(fewer, FEWER, 1 - config.gain) * judged.parent)
 
 
 def worth_a_slot(config: ChimeConfig, population: Population, judged: Judged) -> Bool[Array, "K"]:
-    """Which models explain what nobody else does, by way of something that is controllable."""
+    """True for models that explain something new, by way of something that is controllable."""
     slots, found = config.models, population.models
     nested = found.control != models.ACTION
     reach, able = leads(config, population), controllable(config, population)

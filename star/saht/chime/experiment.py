@@ -131,7 +131,7 @@ class Chime(Experiment):
 def tested(
     hyper: Learner, room: Room, errands: Sequence[Errand], state: State, *, key: Array
 ) -> Float[Array, "n T D 2"]:
-    """Where all discs are in tests, before each action and after the last one.
+    """The places of all discs in tests, before each action and after the last one.
 
     The learner plans with its best model of the disc; without one it acts at random.
     """

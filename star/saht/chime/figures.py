@@ -1,4 +1,4 @@
-"""What a run of CHIME shows of itself: births over time, competence by observable, the hierarchy found, and tests."""
+"""Figures of a run of CHIME: births over time, competence by observable, the hierarchy found, and tests."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def competence(room: Room, rows: Sequence[Row]) -> Figure:
 
 
 def curriculum(room: Room, rows: Sequence[Row]) -> Figure:
-    """What was practised over time, and what moved: means over seeds."""
+    """Practice over time, and movements: means over seeds."""
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
     moments = by_step(rows)
@@ -134,7 +134,7 @@ def summary(rows: Sequence[Row]) -> Figure:
 
 
 def hierarchy(room: Room, last: Sequence[Row]) -> Figure:
-    """Which models are on in the end: an arrow leads from what controls; its label is the share of learners."""
+    """The models that are on in the end: arrows lead from the control, with the share of learners as a label."""
     count: dict[tuple[str, str], float] = {}
     for row in last:
         for pair in {(model["control"], model["outcome"]) for model in row["models"] if model["on"]}:

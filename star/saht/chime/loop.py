@@ -47,7 +47,7 @@ class State(struct.PyTreeNode):
 
 
 class Seen(NamedTuple):
-    """What is told of an epoch."""
+    """The report on an epoch."""
 
     spent: Float[Array, "M 2"]
     """Blocks for each slot, with random actions and with goal babbling."""

@@ -1,4 +1,4 @@
-"""What a learner remembers of its actions: the newest ones, in a ring, and draws of those in which something moved."""
+"""The memory of a learner: its newest actions, in a ring, and draws of those in which something moved."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Memory(struct.PyTreeNode):
     values: Float[Array, "N B 2"]
     """Observables before each action."""
     moved: Bool[Array, "N B+1"]
-    """Which observables have moved; the last one is the action, which counts as moved, but where none is written."""
+    """True for observables that have moved; the last one is the action, which counts as moved once it is written."""
     written: Int[Array, ""]
     """Actions since the beginning."""
 

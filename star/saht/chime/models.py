@@ -5,8 +5,8 @@
 u is the change of the model's control: the action, or the change of an observable that another model predicts, which
 makes models nested. Contexts are the inputs that were chosen for it. All others are masked, so shapes never change.
 
-Source: CHIME (Manoury, Nguyen, Buche, arXiv 2009.10968) has models with evolving inputs. That the effect is linear in
-the change of the control, given what the hidden units see, is ours: without u nothing happens.
+Source: CHIME (Manoury, Nguyen, Buche, arXiv 2009.10968) has models with evolving inputs. It is ours that
+the effect is linear in the change of the control, given the hidden units: without u nothing happens.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Weights(struct.PyTreeNode):
 
 
 class Rows(NamedTuple):
-    """What models learn from."""
+    """Examples for models to learn from."""
 
     seen: Float[Array, "*n O 2"]
     """All possible inputs, before the action."""

@@ -1,7 +1,7 @@
 """Plans through nested models: what has to be so first, and the actions that bring about both.
 
 A goal is a place of one observable. If another observable controls the model of that one, its change has the effect
-only where both are in the right places: for a push, on the side away from the goal. Where that is, was remembered. So
+only where both are in the right places: for a push, on the side away from the goal. Memory tells these places. So
 the plan has levels, from the goal down to the observable that the action controls.
 
     levels    of remembered changes of the outcome the one that fits what is needed; the control has to go where it was
@@ -36,17 +36,17 @@ DEPTH = 3
 ROWS = 64
 CLOSE = 10.0  # units of the room
 FIRST = 0.3
-"""What has to be so first counts so much beside the goal."""
+"""A condition counts so much beside the goal."""
 
 
 class Level(NamedTuple):
-    """What has to be so first."""
+    """A condition that has to hold first."""
 
     control: Int[Array, ""]
     goal: Float[Array, "2"]
     """Of the control."""
     used: Bool[Array, ""]
-    """Whether there is such a level: the action is no control, and something is remembered."""
+    """True if there is such a level: the action is no control, and something is remembered."""
 
 
 class Aim(NamedTuple):
@@ -124,7 +124,7 @@ def imagine(
 def cost(
     first: Level, outcome: Int[Array, ""], goal: Float[Array, "2"], path: Float[Array, "T B 2"]
 ) -> Float[Array, ""]:
-    """How far a path is from the goal, on the way and in the end, and from what has to be so `first` [DEPTH]."""
+    """The distance of a path from the goal, on the way and in the end, and from the conditions `first` [DEPTH]."""
     off = jnp.sqrt(jnp.square(path[:, outcome] - goal).sum(axis=-1))
     away = jnp.sqrt(jnp.square(path[:, first.control] - first.goal).sum(axis=-1)) * first.used  # [T, DEPTH]
     return off.mean() + off[-1] + FIRST * away.sum(axis=-1).mean()

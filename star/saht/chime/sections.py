@@ -25,7 +25,7 @@ class RoomConfig(Section):
 
 
 class ChoiceConfig(Section):
-    """How a task, and a way to practise it, are chosen by progress."""
+    """The choice of a task, and of a way to practise it, by progress."""
 
     random: float = setting(0.1, "This share of choices is drawn evenly.", unit="", ge=0, le=1)
     sharpness: float = setting(2.0, "Choices are drawn in proportion to interest to this power.", unit="", gt=0)
@@ -45,7 +45,7 @@ class ChoiceConfig(Section):
 
 
 class ChimeConfig(Section):
-    """How tasks emerge, and how models of them evolve."""
+    """The birth of tasks, and the evolution of their models."""
 
     tasks: Literal["emerge", "given", "none"] = setting(
         "emerge", "Tasks are found, or all are given at the start, or there are none and actions are random."
@@ -114,7 +114,7 @@ class ChimeTrainer(TrainerConfig):
 
 
 class Learner(Section):
-    """What the jitted functions see."""
+    """The settings that jitted functions see."""
 
     chime: ChimeConfig = ChimeConfig()
 
@@ -136,5 +136,5 @@ class Config(RunConfig):
         return self
 
     def hyper(self) -> Learner:
-        """What the jitted functions see; they have the room of the experiment."""
+        """The settings that jitted functions see; they have the room of the experiment."""
         return Learner(chime=self.chime)
