@@ -172,7 +172,7 @@ class ControllerConfig(LevelConfig):
     )
     frame: Literal["world", "body", "map"] = setting(
         "world",
-        "The Controller sees subgoals in the axes of the world or of its body, or the whole state and places on the map.",
+        "The Controller sees subgoals in axes of the world or of its body, or the whole state and places on the map.",
     )
     hindsight: bool = setting(
         False, "Half of the replayed transitions get a subgoal that was reached; this needs learner td3."
