@@ -140,7 +140,10 @@ def test_it_learns_to_go_to_goals_that_no_reward_tells_of():
     ("level", "message"),
     [
         ({"controller": {"frame": "world"}}, "controller: frame: world, but learner crl needs the places of goals"),
-        ({"tutor": {"enabled": True, "learner": "crl"}}, "tutor: learner: crl learns to reach places"),
+        (
+            {"tutor": {"enabled": True, "learner": "crl"}},
+            "tutor.learner: 'crl' is not allowed: should be 'ppo', 'td3' or 'module:name' of your own",
+        ),
         ({"controller": {"crl": {"buffer_size": 100}}}, "controller.crl.buffer_size: 100 is not a multiple of one"),
         ({"controller": {"crl": {"min_transitions": 97}}}, "controller.crl.min_transitions: 97 exceeds buffer_size 96"),
     ],

@@ -76,7 +76,10 @@ def test_it_trains_checkpoints_and_resumes_bit_for_bit(here, monkeypatch, capsys
         (["--controller.hindsight", "true"], "controller: hindsight needs learner td3, which replays"),
         (["--controller.learner", "mine:other"], "mine holds no other; allowed: a star.learners.protocol.Learner"),
         (["--controller.learner", "mine:Config"], "is a class; allowed: a star.learners.protocol.Learner"),
-        (["--controller.learner", "mine.it"], "'mine.it' is not allowed: should be 'ppo', 'td3' or 'module:name'"),
+        (
+            ["--controller.learner", "mine.it"],
+            "'mine.it' is not allowed: should be 'ppo', 'td3', 'crl' or 'module:name'",
+        ),
         (["--controller.learner", "nobody:has"], "cannot be imported: ModuleNotFoundError: No module named 'nobody'"),
         (["--controller.learner", "ppo", "--controller.own.std", "1"], "controller.own: 'std' is no setting of ppo"),
     ],
