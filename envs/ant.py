@@ -16,6 +16,7 @@ that is open.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from importlib import resources
 from typing import Any
 
@@ -128,7 +129,7 @@ class Ant:
         self._arena = task.arena
         self._switch: Switch | None = task.switch
         self._block_noise = task.block_noise
-        self._own = (collisions, model)
+        self._spec = partial(spec, collisions=collisions, model=model)
         self._observed = observed
         self._max_torque = MAX_TORQUE * action_scale
         self._closed = np.asarray(physics.mocap_pos)
@@ -199,7 +200,7 @@ class Ant:
 
     def model(self) -> mujoco.MjModel:
         """The model with a checkered floor."""
-        return scene.build_model(self._arena, spec(collisions=self._own[0], model=self._own[1]), {}, visual=True)
+        return scene.build_model(self._arena, self._spec(), {}, visual=True)
 
     def pose(self, data: PhysicsState) -> tuple[jax.Array, jax.Array]:
         """(qpos, mocap_pos)."""

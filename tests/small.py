@@ -35,6 +35,24 @@ def arrays(run, env_steps):
         return checkpoints.arrays(env_steps)
 
 
+def killed(run, copy, *, steps):
+    """A copy of `run` as if it had been killed in a line of metrics, before the checkpoints at `steps`."""
+    shutil.copytree(run, copy)
+    for step in steps:
+        shutil.rmtree(f"{copy}/checkpoints/{step}")
+    with Path(copy, "metrics.jsonl").open("a") as file:
+        file.write('{"seed": 0, "env_')
+
+
+def assert_the_same(run, other, env_steps):
+    """All arrays of two runs' checkpoints, bit for bit; returns their names."""
+    found, expected = arrays(run, env_steps), arrays(other, env_steps)
+    assert found.keys() == expected.keys()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    return expected.keys()
+
+
 def unpacked(name, folder):
     """The run in `tests/data/<name>.zip`, in a new folder below `folder`."""
     shutil.unpack_archive(Path(__file__).parent / "data" / f"{name}.zip", folder / name)

@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 
 from scripts.pages import charts
-from scripts.results.saht import ROOT, STAR, Claim, less, mean, ratio
+from scripts.results.claims import Claim, less, mean, ratio, shown, told
+from scripts.results.saht import ROOT, STAR
 from star.config.loading import load_run
-from star.report.statistics import stratified
 from star.saht.chime.experiment import Chime
 from star.saht.chime.figures import FIRSTS, firsts
 from star.training.figures import save
@@ -131,17 +131,9 @@ def table(found: Mapping[str, Any], made: list[Claim]) -> str:
     for name, one in found.items():
         cells = []
         for column in columns:
-            value, low, high = stratified([one["tests"][column][-1]], lambda x: x.mean())
-            digits = 2 if column.startswith("success") else 1
-            cells.append(f"{value:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]")
+            cells.append(shown(np.asarray(one["tests"][column][-1]), digits=2 if column.startswith("success") else 1))
         lines.append(f"| {name} | {' | '.join(cells)} | {one['wall_s']:.0f} |")
-    lines += ["", "| | claim | found | wanted | |", "|---|---|---|---|---|"]
-    for one in made:
-        lines.append(
-            f"| {one.row} | {one.text} | {one.value:.3f} [{one.low:.3f}, {one.high:.3f}] | {one.wanted} "
-            f"| {'holds' if one.holds else '**failed**'} |"
-        )
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", *told(made)]) + "\n"
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -25,17 +25,18 @@ import json
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from envs import worlds
 from scripts.pages import charts
+from scripts.results.claims import Claim, less, mean, ratio, shown, told
 from star.config.loading import load_run
-from star.report.statistics import over_seeds, stratified
+from star.report.statistics import over_seeds
 from star.saht.experiment import Saht
 from star.saht.figures import TASKS, colour, plain_ticks
 from star.training.journal import Journal, by_step
@@ -105,19 +106,6 @@ OF_WORLD = {
     "table": ("sgim_pb", "im_pb", "sagg_riac", "random", "sgim_pb_even", "mimicry", "im_pb_small", "im_pb_taught")
     + IMITATORS,
 }
-
-
-class Claim(NamedTuple):
-    """A claim, the finding, and True if it holds."""
-
-    row: str
-    """The letter of the claim in docs/saht.md."""
-    text: str
-    value: float
-    low: float
-    high: float
-    wanted: str
-    holds: bool
 
 
 def trained(world: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
@@ -230,26 +218,6 @@ def _share(algorithm: Mapping[str, Any], task: int, begins: Sequence[str]) -> np
     mine = [any(way.startswith(one) for one in begins) for way in algorithm["ways"]]
     chosen = np.asarray(algorithm["chosen"], float)[:, task]
     return chosen[:, mine].sum(axis=1) / np.maximum(chosen.sum(axis=1), 1)
-
-
-def mean(row: str, text: str, sample: np.ndarray, wanted: str, passes: Callable[[float], bool]) -> Claim:
-    """A claim about the mean of a sample."""
-    value, low, high = stratified([sample], lambda x: x.mean())
-    return Claim(row, text, float(value), float(low), float(high), wanted, passes(float(value)))
-
-
-def ratio(
-    row: str, text: str, one: np.ndarray, other: np.ndarray, wanted: str, passes: Callable[[float], bool]
-) -> Claim:
-    """A claim about the ratio of two means."""
-    value, low, high = stratified([one, other], lambda x, y: x.mean() / y.mean())
-    return Claim(row, text, float(value), float(low), float(high), wanted, passes(float(value)))
-
-
-def less(row: str, text: str, one: np.ndarray, other: np.ndarray) -> Claim:
-    """A claim that the mean of `one` is less than that of `other`."""
-    value, low, high = stratified([one, other], lambda x, y: x.mean() - y.mean())
-    return Claim(row, text, float(value), float(low), float(high), "below 0, interval too", bool(high < 0))
 
 
 def claims_of_pen(found: Mapping[str, Any]) -> list[Claim]:
@@ -424,16 +392,9 @@ def table(found: Mapping[str, Any], claims: Sequence[Claim]) -> str:
     for name, one in found.items():
         cells = []
         for task in tasks:
-            value, low, high = stratified([_final(one, task)], lambda x: x.mean())
-            cells.append(f"{value:.3f} [{low:.3f}, {high:.3f}]")
+            cells.append(shown(_final(one, task)))
         lines.append(f"| {name} | {' | '.join(cells)} | {one['wall_s']:.0f} |")
-    lines += ["", "| | claim | found | wanted | |", "|---|---|---|---|---|"]
-    for one in claims:
-        lines.append(
-            f"| {one.row} | {one.text} | {one.value:.3f} [{one.low:.3f}, {one.high:.3f}] | {one.wanted} "
-            f"| {'holds' if one.holds else '**failed**'} |"
-        )
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", *told(claims)]) + "\n"
 
 
 def draw(found: Mapping[str, Any]) -> Figure:
@@ -514,8 +475,8 @@ def main(arguments: list[str] | None = None) -> None:
         old[name] = trained(options.world, name, options)
         found = {one: old[one] for one in ALGORITHMS if one in old}
         claims = CLAIMS[options.world](found) + at_equal_cost(found)
-        told = {"world": options.world, "noise": options.noise, "claims": [one._asdict() for one in claims]}
-        place.write_text(json.dumps(told | {"algorithms": found}) + "\n", encoding="utf-8")
+        about = {"world": options.world, "noise": options.noise, "claims": [one._asdict() for one in claims]}
+        place.write_text(json.dumps(about | {"algorithms": found}) + "\n", encoding="utf-8")
         place.with_suffix(".md").write_text(table(found, claims), encoding="utf-8")
         draw(found).savefig(place.with_suffix(".png"), dpi=80)
         if at_equal_cost(found):

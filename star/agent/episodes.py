@@ -8,11 +8,10 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from star.agent.play import Episode
+from star.agent.play import MISHAPS, Episode
 from star.report import statistics
 
 MEASURES = ("success_any", "success_final")
-MISHAPS = ("flipped", "fallen", "unhealthy")  # fields of `Episode`
 FAILURES = (*MISHAPS, "stuck", "out_of_time")
 """Why an episode never reached its goal: the first that holds."""
 

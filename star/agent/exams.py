@@ -23,8 +23,8 @@ from envs import goal_env, routes
 from envs.common import modes
 from envs.vector import VectorEnv
 from star.agent import environment
-from star.agent.episodes import MEASURES, MISHAPS, Trials, failures, success_behind, summarise, summarise_way
-from star.agent.play import Episode, greedy
+from star.agent.episodes import MEASURES, Trials, failures, success_behind, summarise, summarise_way
+from star.agent.play import MISHAPS, Episode, greedy
 from star.agent.sections import Config
 from star.config.loading import parse
 from star.config.section import ConfigError

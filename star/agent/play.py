@@ -31,6 +31,8 @@ from star.agent.state import TrainState
 from star.sgim.lessons import Marks
 from star.spec import Spec
 
+MISHAPS = ("flipped", "fallen", "unhealthy")  # of an environment's metrics
+
 
 class Episode(struct.PyTreeNode):
     """Running statistics of each environment's episode."""
@@ -61,10 +63,8 @@ class Episode(struct.PyTreeNode):
             success_final=jnp.where(alive > 0, success, self.success_final),
             distance=jnp.where(alive > 0, distance, self.distance),
             total=self.total + env_state.reward * alive,
-            flipped=jnp.where(alive > 0, env_state.metrics["flipped"], self.flipped),
-            fallen=jnp.where(alive > 0, env_state.metrics["fallen"], self.fallen),
-            unhealthy=jnp.where(alive > 0, env_state.metrics["unhealthy"], self.unhealthy),
             time_at_goal=self.time_at_goal + success * alive,
+            **{name: jnp.where(alive > 0, env_state.metrics[name], getattr(self, name)) for name in MISHAPS},
         )
 
 

@@ -89,9 +89,9 @@ class ChoiceConfig(Section):
     @property
     def selection(self) -> SelectionConfig:
         """The same for `star.sgim.selection`."""
-        usual = {name: getattr(SelectionConfig(), name) for name in SelectionConfig.model_fields}
-        own = {"random": self.random, "sharpness": self.sharpness, "optimism": self.optimism, "drift": self.drift}
-        return SelectionConfig.model_construct(**usual | own)
+        return SelectionConfig.model_construct(
+            random=self.random, sharpness=self.sharpness, optimism=self.optimism, drift=self.drift
+        )
 
 
 class SahtConfig(Section):

@@ -15,7 +15,7 @@ import envs
 from star import cli
 from star.agent import episodes, exam_results, exam_tables, exams, films
 from star.agent.exams import Exam, Target
-from star.agent.play import Episode
+from star.agent.play import MISHAPS, Episode
 from star.config import loading
 from star.report import history
 from star.training import checkpoint
@@ -128,7 +128,7 @@ def test_the_reason_of_a_failure_is_the_first_that_holds():
     rng = np.random.default_rng(1)
     position = rng.normal(size=(9, 60, 2)).cumsum(axis=0)
     success_any, *mishaps = (rng.random((4, 60)) < [[0.2], [0.3], [0.3], [0.1]]).astype(float)
-    holds = dict(zip(episodes.MISHAPS, mishaps, strict=True))
+    holds = dict(zip(MISHAPS, mishaps, strict=True))
     ended = Episode.start(60).replace(success_any=jnp.asarray(success_any), **jax.tree.map(jnp.asarray, holds))
     found = measured(ended, position, np.zeros((9, 60)), radius=2.5)
 

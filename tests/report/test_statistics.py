@@ -11,7 +11,7 @@ from scipy import stats
 
 from star.agent import episodes
 from star.agent.episodes import Trials
-from star.agent.play import Episode
+from star.agent.play import MISHAPS, Episode
 from star.report import statistics
 from star.report.statistics import TAUS
 
@@ -22,7 +22,7 @@ OTHER = {"maze": [0.2, 0.4], "rooms": [0.7, 0.1, 0.9, 1.0], "fall": [0.5]}
 def trials(reached, steps, path, there=None):
     """Episodes that begin at the origin."""
     unused = np.zeros(len(reached))
-    rest = dict.fromkeys(("success_final", "distance", "total", *episodes.MISHAPS), unused)
+    rest = dict.fromkeys(("success_final", "distance", "total", *MISHAPS), unused)
     there = unused if there is None else np.array(there, float)
     ended = Episode(success_any=np.array(reached, float), time_at_goal=there, **rest)
     places = np.zeros((len(reached), 2))

@@ -1,7 +1,6 @@
 """Whole runs of CHIME in a small room: what they learn, leave, resume and refuse."""
 
 import re
-import shutil
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -13,7 +12,7 @@ from star.cli import main
 from star.config.loading import parse
 from star.training import program as programs
 from star.training.journal import JsonLines
-from tests.small import arrays
+from tests.small import assert_the_same, killed
 
 PAGE = Path(__file__).parents[2] / "docs" / "chime.md"
 CONFIG = {
@@ -63,16 +62,9 @@ def test_every_metric_is_explained_and_every_explained_metric_exists():
 
 
 def test_a_run_that_was_killed_goes_on_bit_for_bit_and_nothing_is_compiled_twice(undrawn):
-    shutil.copytree("whole", "killed")
-    for step in (120, 160):
-        shutil.rmtree(f"killed/checkpoints/{step}")
-    with Path("killed/metrics.jsonl").open("a") as file:
-        file.write('{"seed": 0, "env_')
+    killed("whole", "killed", steps=(120, 160))
     assert main(["train", "--resume", "killed", "--quiet"]) == 0
-    found, expected = arrays("killed", 160), arrays("whole", 160)
-    assert found.keys() == expected.keys()
-    for name, array in expected.items():
-        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    assert_the_same("killed", "whole", 160)
     assert programs.build(parse(CONFIG)).functions.epoch._cache_size() == 1
 
 

@@ -18,7 +18,7 @@ from star.saht.memory import scale_of
 from star.saht.proposals import Dice, Order
 from star.training import program as programs
 from star.training.journal import JsonLines
-from tests.small import arrays
+from tests.small import arrays, assert_the_same, killed
 
 PAGE = Path(__file__).parents[2] / "docs" / "worlds.md"
 CONFIG = {
@@ -99,16 +99,9 @@ def test_every_metric_is_explained_and_every_explained_metric_exists():
 
 
 def test_a_run_that_was_killed_goes_on_bit_for_bit(undrawn):
-    shutil.copytree("whole", "killed")
-    for step in (150, 200):
-        shutil.rmtree(f"killed/checkpoints/{step}")
-    with Path("killed/metrics.jsonl").open("a") as file:
-        file.write('{"seed": 0, "env_')
+    killed("whole", "killed", steps=(150, 200))
     assert main(["train", "--resume", "killed", "--quiet"]) == 0
-    found, expected = arrays("killed", 200), arrays("whole", 200)
-    assert found.keys() == expected.keys()
-    for name, array in expected.items():
-        np.testing.assert_array_equal(found[name], array, err_msg=name)
+    assert_the_same("killed", "whole", 200)
 
 
 def test_a_learner_alone_chooses_as_it_does_among_others_and_nothing_is_compiled_twice():

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from scripts.results import claims as claims_of
 from tests.scripts import load
 
 ROOT = Path(__file__).parents[2]
@@ -45,7 +46,7 @@ def verdicts(claims, row):
 
 def test_claims_hold_or_fail_as_the_numbers_say(monkeypatch):
     script = load("results/saht")
-    monkeypatch.setattr(script, "stratified", without_draws)
+    monkeypatch.setattr(claims_of, "stratified", without_draws)
     good = {
         "sgim_pb": algorithm(0.1, asked=(0.5, 0.1)),
         "sgim_acts": algorithm(0.12),
@@ -78,7 +79,7 @@ def imitator(error, asked):
 
 def test_imitators_are_compared_where_all_have_asked_as_much(monkeypatch):
     script = load("results/saht")
-    monkeypatch.setattr(script, "stratified", without_draws)
+    monkeypatch.setattr(claims_of, "stratified", without_draws)
     found = {"sgim_acts": imitator(0.2, 1000), "dagger": imitator(0.2, 2000), "cba": imitator(0.1, 500)}
     claims = {claim.text: claim for claim in script.at_equal_cost(found)}
     (dagger, cba) = claims.values()
@@ -91,7 +92,7 @@ def test_imitators_are_compared_where_all_have_asked_as_much(monkeypatch):
 
 def test_claims_about_fishing_and_the_table_hold_or_fail_as_the_numbers_say(monkeypatch):
     script = load("results/saht")
-    monkeypatch.setattr(script, "stratified", without_draws)
+    monkeypatch.setattr(claims_of, "stratified", without_draws)
 
     def fishing(error, area):
         return algorithm(error) | {"areas": [[area] * 4]}
@@ -140,9 +141,8 @@ def test_what_a_learner_can_do_becomes_a_teacher_of_others(tmp_path, monkeypatch
 
 
 def test_an_interval_that_reaches_zero_is_no_difference():
-    script = load("results/saht")
     one, other = np.array([0.1, 0.3, 0.2, 0.2]), np.array([0.3, 0.2, 0.2, 0.2])
-    claim = script.less("f", "", one, other)
+    claim = claims_of.less("f", "", one, other)
     assert claim.value < 0 < claim.high and not claim.holds
 
 

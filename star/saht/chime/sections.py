@@ -39,9 +39,8 @@ class ChoiceConfig(Section):
     @property
     def selection(self) -> SelectionConfig:
         """The same for `star.sgim.selection`, which remembers no goals here."""
-        usual = {name: getattr(SelectionConfig(), name) for name in SelectionConfig.model_fields}
         own = {name: getattr(self, name) for name in ChoiceConfig.model_fields}
-        return SelectionConfig.model_construct(**usual | own | {"best": 0.0, "window": 4, "per_block": 1})
+        return SelectionConfig.model_construct(**own, best=0.0, window=4, per_block=1)
 
 
 class ChimeConfig(Section):
