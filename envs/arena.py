@@ -5,9 +5,10 @@ A map has a row of characters for each row of cells:
     1  wall            0  free             r  free, and the robot starts here      g  free, and a goal
     #  no floor        B  movable block    D  gate (door)
 
-The centre of the first robot's cell is the origin, +x runs right along a row, +y runs down the rows. Walls, blocks
-and gates are 4 m high whatever the size of the cells, so that no ant leaps over them. If a map has cells without floor,
-the floor of all others is raised by as much.
+A map of the user's own looks as it is written: +x runs right along a row, +y up from row to row. The centre of its
+lowest robot's cell, of several the leftmost, is the origin. Walls, blocks and gates are 4 m high whatever the size of
+the cells, so that no ant leaps over them. If a map has cells without floor, the floor of all others is raised by as
+much.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ Cell = tuple[int, int]
 
 @dataclass(frozen=True)
 class Arena:
-    """A maze. `rows` are strings of equal length, `cell` is the side of a cell in m.
+    """A maze. `rows` are strings of equal length, from the lowest y up, `cell` is the side of a cell in m.
 
     `block` names the axes along which the blocks `B` slide: some of x, y and z; along z they fall.
     """
@@ -143,9 +144,9 @@ class Arena:
 def read_arena(source: str, *, cell: float) -> Arena:
     """The arena of a user's map: the path of a file, or what would be in it if `source` has several lines.
 
-    It is either the rows as plain text, or YAML with the rows as a block of text under `map` and, if wanted, `cell`
-    (m) and `block` (axes). `cell` is the size of cells that the map does not give. Free cells that cannot be reached
-    become walls, which a `Notice` tells.
+    It is either the rows as plain text, the uppermost first, or YAML with the rows as a block of text under `map` and,
+    if wanted, `cell` (m) and `block` (axes). `cell` is the size of cells that the map does not give. Free cells that
+    cannot be reached become walls, which a `Notice` tells.
 
     Raises:
       EnvError: in one line that names the file, and the row and column counted from 1.
@@ -160,7 +161,8 @@ def read_arena(source: str, *, cell: float) -> Arena:
         cells = "1 free cell" if len(sealed) == 1 else f"{len(sealed)} free cells"
         where = f'cannot be reached from "{ROBOT}", the first at row {r + 1}, column {c + 1}'
         warnings.warn(Notice(f"{name}: {cells} {where}: taken for walls, without goals or starts"), stacklevel=2)
-    return walled(arena, sealed)
+    written = walled(arena, sealed)
+    return replace(written, rows=written.rows[::-1])
 
 
 def load(source: str) -> str:
@@ -208,7 +210,10 @@ def _from_yaml(text: str, cell: float, *, name: str) -> Arena:
 
 
 def check(arena: Arena, *, name: str) -> Arena:
-    """`arena` itself, if a body can live in it; raises `EnvError` in one line that begins with `name`."""
+    """`arena` itself, if a body can live in it; raises `EnvError` in one line that begins with `name`.
+
+    Rows are counted as they stand.
+    """
     rows = arena.rows
     if not rows or not rows[0]:
         raise EnvError(f"{name}: is empty")

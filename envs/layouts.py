@@ -1,4 +1,4 @@
-"""The maps of the tasks, in m at their own size of cells. Nothing here needs JAX or MuJoCo."""
+"""The maps of the tasks, from the lowest y up, in m at their own size of cells. Nothing here needs JAX or MuJoCo."""
 
 from __future__ import annotations
 

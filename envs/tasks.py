@@ -261,7 +261,8 @@ def on_map(body: str, arena: Arena, *, clearance: float) -> Task:
 def _refuse(arena: Arena, strange: Mapping[str, str]) -> None:
     """Raise `EnvError` if `arena` has a cell that holds one of `strange`, symbols and what they stand for."""
     for r, c in arena.cells("".join(strange)):
-        raise EnvError(f"map: row {r + 1}, column {c + 1} is {strange[arena.rows[r][c]]}")
+        row = len(arena.rows) - r  # counted as in the text, from above
+        raise EnvError(f"map: row {row}, column {c + 1} is {strange[arena.rows[r][c]]}")
 
 
 # The published tasks (star.md of the paper's experiments): 8 m cells, success within 5 m.

@@ -55,13 +55,13 @@ def with_ends(grid: Grid, *, cell: float) -> tuple[str, float]:
     """The map with its start and goal, and the length of the shortest way between them, in m."""
     started = [row[:] for row in grid]
     started[1][1] = "r"
-    found = arena.read_arena("\n".join(map("".join, started)), cell=cell)
+    found = arena.Arena(tuple(map("".join, started)), cell)
     goal = np.array([arena.farthest(found)])
     row, column = found.cell_at(goal[0])
     started[row][column] = "g"
     start = np.array([found.centre((1, 1))])
     (way,) = np.ravel(routes.distances(found, start, goal))
-    return "\n".join(map("".join, started)), float(way)
+    return "\n".join(map("".join, started[::-1])), float(way)
 
 
 def made(seed: int, *, rows: int, columns: int, loops: int, cell: float, way: tuple[float, float]) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from star.config import agents
 from star.config.loading import load_to_act, parse
 from star.config.section import ConfigError
 
@@ -108,7 +109,9 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         task, others = _split_task(overrides)
         config = load_to_act(options.run, others)
         if options.task not in (None, config.env.name):
-            raise ConfigError(f"{options.run}: its agent was trained on {config.env.name}, not on {options.task}")
+            raise ConfigError(
+                f"{agents.told(options.run)}: its agent was trained on {config.env.name}, not on {options.task}"
+            )
     check_output(options.out, force=options.force)
 
     from star.agent import exams, films

@@ -16,6 +16,7 @@ from envs.vector import VectorEnv
 from star.agent import environment
 from star.agent.play import greedy
 from star.agent.sections import Config
+from star.config import agents
 from star.config.section import ConfigError
 from star.sgim import teachers
 from star.sgim.teachers import Demonstrations
@@ -58,7 +59,9 @@ def record(
         moments, spec = play(config, run_dir, checkpoint=checkpoint, agent=agent, episodes=episodes, seed=seed)
     demos = demonstrations(moments, spec, period=config.commander.period)
     if demos is None:
-        raise ConfigError(f"{run_dir}: none of {episodes} episodes reaches its goal, there is nothing to show")
+        raise ConfigError(
+            f"{agents.told(run_dir)}: none of {episodes} episodes reaches its goal, there is nothing to show"
+        )
     teachers.save(out, demos, env=config.env.name, force=force)
     steps = f"{np.median(np.asarray(demos.lengths)):g} env steps (median)"
     return f"{out}: {len(demos.starts)} of {episodes} episodes reach their goal, in {steps}"

@@ -26,6 +26,7 @@ from star.agent import environment
 from star.agent.episodes import MEASURES, Trials, failures, success_behind, summarise, summarise_way
 from star.agent.play import MISHAPS, Episode, greedy
 from star.agent.sections import Config
+from star.config import agents
 from star.config.loading import parse
 from star.config.section import ConfigError
 from star.report import statistics
@@ -318,7 +319,7 @@ def _row(entry: _Entry, exam: Exam, trials: Trials, shortest: np.ndarray | None)
         own = (None if found is None else found[i] for found in (shortest, behind))
         per_seed.append({"seed": seed} | summary(one, *own) | {"failed": failed})
     row = {
-        "run": str(entry.run_dir),
+        "run": agents.told(entry.run_dir),
         "env": course.env.name,
         "options": course.options,
         "engine": course.env.engine,

@@ -34,5 +34,5 @@ def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     options.run = agents.find(options.run)
     kind = runs.kind_of([options.run], "record")
     if "record" not in kind.commands:
-        raise ConfigError(f"{options.run}: its experiment makes no demonstrations")
+        raise ConfigError(f"{agents.told(options.run)}: its experiment makes no demonstrations")
     return kind.commands["record"](options, overrides)

@@ -14,6 +14,7 @@ _IN_WHEEL = Path(__file__).parents[1] / "agents"
 _IN_CLONE = Path(__file__).parents[2] / "results" / "agents"
 
 FOLDER = _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CLONE
+_places: set[Path] = set()  # of agents that are unpacked
 
 
 def names() -> list[str]:
@@ -27,6 +28,11 @@ def find(run_dir: Path) -> Path:
     return _unpacked(name) if not os.path.lexists(run_dir) and name in names() else run_dir
 
 
+def told(run_dir: Path) -> str:
+    """`run_dir` in the words of who gave it: the name of an agent that `find` has unpacked there."""
+    return run_dir.name if run_dir in _places else str(run_dir)
+
+
 def near(run_dir: Path) -> str:
     """` (did you mean ...?)` with the name that is most like `run_dir`, or nothing."""
     matches = difflib.get_close_matches(run_dir.as_posix(), names(), n=1, cutoff=0.7)
@@ -38,4 +44,5 @@ def _unpacked(name: str) -> Path:
     folder = Path(tempfile.mkdtemp(prefix="star-agent-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     shutil.unpack_archive(FOLDER / f"{name}.zip", folder / name)
+    _places.add(folder / name)
     return folder / name

@@ -29,7 +29,7 @@ import numpy as np
 from envs.common import files
 from star import devices
 from star._quiet import ocp
-from star.config import kinds
+from star.config import agents, kinds
 from star.config.kinds import About, Arrays, Kind, Measure
 from star.config.loading import DEFAULT, parse
 from star.config.run import RunConfig
@@ -347,7 +347,9 @@ def agent_number(program: Program, run_dir: Path, agent: int | None) -> int:
     if agent is None:
         return 0
     if agent not in program.seeds:
-        raise ConfigError(f"--seed: {agent} is not among those of {run_dir}: {', '.join(map(str, program.seeds))}")
+        raise ConfigError(
+            f"--seed: {agent} is not among those of {agents.told(run_dir)}: {', '.join(map(str, program.seeds))}"
+        )
     return program.seeds.index(agent)
 
 

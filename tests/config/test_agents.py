@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from star.config import agents
-from star.config.loading import load_to_act
+from star.config.loading import load, load_to_act
 from star.training.checkpoint import opened
 
 
@@ -13,7 +13,8 @@ from star.training.checkpoint import opened
 def test_each_agent_is_whole_and_of_the_task_of_its_name(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = agents.find(Path(name))
-    assert load_to_act(folder, {}).env.name == name
+    trained, offered = load_to_act(folder, {}).env, load(name).env
+    assert (trained.name, trained.options) == (offered.name, offered.options) and agents.told(folder) == name
     with opened(folder) as checkpoints:
         (step,) = checkpoints.steps()
         checkpoints.check(step)

@@ -106,14 +106,15 @@ def test_text_yaml_and_rows_give_the_same_arena(tmp_path):
 def test_on_a_map_of_ones_own_goals_success_and_regions_follow_the_map():
     env = envs.make("point_maze", map=OWN, cell=4.0, goals="test")
     assert env.success_radius == 2.5
-    assert [corner.tolist() for corner in env.space] == [[-2.0, -2.0], [10.0, 10.0]]
-    assert env.region_cuts == ((4.0,), (4.0,))
+    # As in the text: +x points right, +y up, and the goal lies two rows below the start.
+    assert [corner.tolist() for corner in env.space] == [[-2.0, -10.0], [10.0, 2.0]]
+    assert env.region_cuts == ((4.0,), (-4.0,))
     assert TASKS["point_maze"].goals["test"].lower == ((0.0, 16.0),)
-    assert env.reset(jax.random.key(0)).obs[-2:].tolist() == [0.0, 8.0]
+    assert env.reset(jax.random.key(0)).obs[-2:].tolist() == [0.0, -8.0]
 
 
 def test_on_a_map_with_a_gap_nobody_in_it_is_near_a_goal():
-    rows = "block: yz\nmap: |\n  1111\n  1r01\n  10B1\n  1##1\n  1001\n  1111"
+    rows = "block: yz\nmap: |\n  1111\n  1001\n  1##1\n  10B1\n  1r01\n  1111"
     env = envs.make("ant_maze", engine="native", map=rows)
     state = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(0), 100))
     goals = np.asarray(state.obs)[:, -2:]
@@ -145,8 +146,8 @@ SEALED = """
 def test_cells_that_nobody_reaches_are_told_of_and_hold_neither_goals_nor_starts(name, options):
     with pytest.warns(Notice, match=r"^map: 2 free cells cannot be reached .* row 2, column 6: taken for walls[^\n]*$"):
         env = envs.make(name, map=SEALED, cell=4.0, **options)
-    assert env.arena.rows[1:3] == ("1r00111", "1000111")
-    np.testing.assert_array_equal(env.space[1], [10.0, 6.0])
+    assert env.arena.rows[1:3] == ("1000111", "1r00111")
+    np.testing.assert_array_equal(env.space, [[-2.0, -6.0], [10.0, 2.0]])
     keys = jax.random.split(jax.random.key(0), 200)
     goals = jax.vmap(env.draw_goal)(keys)
     starts = jax.vmap(lambda key: sample(env._starts, key))(keys)
