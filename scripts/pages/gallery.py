@@ -16,7 +16,7 @@ from star import cli
 
 DOCS = Path(__file__).parents[2] / "docs"
 HEADING = "## Tasks\n"
-SETTINGS = "--steps 0 --height 340 --env.options.goals test"
+SETTINGS = "--height 340"
 
 
 def main() -> int:

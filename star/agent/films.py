@@ -42,8 +42,9 @@ WIDE = 16 / 9  # the shape that several tiles together come near to
 
 @dataclass(frozen=True)
 class Show:
-    """The picture to draw: `envs` environments for `steps` env steps (None: the episode), every `every`th of them.
+    """The picture to draw: `envs` environments for `steps` env steps, every `every`th of them.
 
+    `steps` None is the episode, but in a still without an agent 0.
     `camera` None is `overview` in a still and `follow` in a film; `height` None goes by the number of environments.
     """
 
@@ -106,7 +107,8 @@ def render(
     with _progress(Console(stderr=True), quiet) as progress:
         task = progress.add_task("recording", total=None, since=time.monotonic())
         if run_dir is None:
-            recording = record_random(config, envs=show.envs, steps=show.steps, seed=exam.seed)
+            steps = 0 if show.steps is None and video.is_still(show.out) else show.steps
+            recording = record_random(config, envs=show.envs, steps=steps, seed=exam.seed)
         else:
             recording = record_run(
                 config,
@@ -122,13 +124,13 @@ def render(
         progress.update(task, description="drawing", total=len(times), since=None)
         pictures = _ticking(draw(recording, show, times), progress, task)
         written = video.write(show.out, pictures, fps=show.fps)
-    return f"{show.out}: {written} picture{'s' * (written > 1)}; {_outcome(recording)}"
+    return f"{show.out}: {written} picture{'s' * (written > 1)}{_outcome(recording)}"
 
 
 def record_random(config: Config, *, envs: int, steps: int | None, seed: int) -> Recording:
-    """Actions drawn uniformly from all possible ones."""
+    """Actions drawn uniformly from all possible ones, on test goals unless `env.options.goals` says otherwise."""
     programs.select_device(config.trainer.device)
-    env = environment.make(config, "train")
+    env = environment.make(config, "train" if "goals" in config.env.options else "test")
     goal_env.need(env, "star render", *goal_env.DRAWN)
     vector = VectorEnv(env, envs, auto_reset=False)
     length = _length(env.episode_length, steps)
@@ -280,9 +282,11 @@ def _length(episode_length: int, steps: int | None) -> int:
 
 def _outcome(recording: Recording) -> str:
     success = recording.moments.success.max(axis=0) > 0
+    if len(recording.moments.obs) == 1:
+        return ""
     if len(success) > 1:
-        return f"{success.sum()} of {len(success)} reach the goal"
-    return f"the goal is {'reached' if success[0] else 'not reached'}"
+        return f"; {success.sum()} of {len(success)} reach the goal"
+    return f"; the goal is {'reached' if success[0] else 'not reached'}"
 
 
 def _progress(console: Console, quiet: bool) -> Progress:

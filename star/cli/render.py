@@ -17,7 +17,7 @@ HELP = "pictures of a task or of an agent"
 DESCRIPTION = """\
 Random actions in TASK, or with --run the greedy policy of a trained agent on test goals.
 Of a world: what its teacher shows, or with --run how a learner reaches goal K of its TASK (--episode K).
-.png and .jpg hold one picture, the end of the episode; .mp4, .gif and .html the whole of it.
+.png and .jpg hold one picture, of a task its start, of an agent the end of the episode; .mp4, .gif and .html hold all.
 A setting of the task is given as --env.options.KEY VALUE."""
 
 
@@ -43,7 +43,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episode", type=natural, metavar="K", help="show episode K of `star evaluate` of the run")
     parser.add_argument("--episodes", dest="trainer.eval_episodes", metavar="N", help="that evaluation's --episodes")
     add_goals(parser)
-    parser.add_argument("--steps", type=natural, metavar="N", help="env steps (default: the whole episode)")
+    parser.add_argument(
+        "--steps", type=natural, metavar="N", help="env steps (default: the whole episode; 0 in a picture of a task)"
+    )
     parser.add_argument("--every", type=count(), default=2, metavar="N", help="draw every Nth env step (default: 2)")
     parser.add_argument("--fps", type=count(50), default=20, metavar="N", help="pictures a second (default: 20)")
     parser.add_argument(
