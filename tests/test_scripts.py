@@ -558,3 +558,27 @@ def test_a_maze_has_its_loops_and_a_way_as_long_as_it_says(tmp_path, capsys, loo
     with pytest.raises(SystemExit, match="2"):
         script.main([*words, "--rows", "1", "--columns", "2"])
     assert capsys.readouterr().err == "error: --way: no maze of 1 x 2 rooms has one of 60 to 90 m\n"
+
+
+def test_the_transcript_of_the_tutorial_is_what_its_commands_print(tmp_path):
+    script = load("pages/tutorial")
+    page = """Write `a.txt`.
+
+```text title="a.txt"
+one
+```
+
+```bash
+cat a.txt; seq 20
+```
+
+```console
+something old
+```
+"""
+    made, seconds = script.told(page, tmp_path)
+    last = "".join(f"{number}\n" for number in range(7, 21))
+    assert made == page.replace("something old\n", f"...\n{last}") and script.told(made, tmp_path)[0] == made
+    assert [command for command, _ in seconds] == ["cat a.txt; seq 20"]
+    with pytest.raises(SystemExit, match="false: exit code 1"):
+        script.told("```bash\nfalse\n```\n", tmp_path)
