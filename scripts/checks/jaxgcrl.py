@@ -77,7 +77,7 @@ def theirs(clone: Path, task: str) -> tuple[Any, np.ndarray]:
 
 
 def goals(clone: Path, task: str, origin: np.ndarray, drawn: np.ndarray) -> dict[str, Any]:
-    """Whether goals agree; `drawn` [n, 2] are its goals at resets."""
+    """The comparison of goals; `drawn` [n, 2] are its own at resets."""
     ours = TASKS[OURS[task]].goals
     if task == "ant":
         radii = [np.linalg.norm(places, axis=1) for places in (drawn, ours["train"].lower)]
@@ -142,7 +142,7 @@ def stepped(env: Any, seen: Seen) -> tuple[np.ndarray, np.ndarray]:
 
 
 def touching(model: mujoco.MjModel, states: np.ndarray) -> dict[str, int]:
-    """How many of `states` [n, 29] touch a wall, and how many the ant itself."""
+    """Counts of `states` [n, 29] in which the ant touches a wall, and itself."""
     data, counts = mujoco.MjData(model), {"walls": 0, "itself": 0}
     for state in states:
         data.qpos = state[:QPOS]

@@ -132,7 +132,7 @@ def update(
 
 
 class Future(NamedTuple):
-    """What may be drawn from a ring: the first `number` items of `going`. Of each of its items, the steps `left`."""
+    """Items of a ring that others follow: the first `number` of `going`. `left` has the steps that follow each item."""
 
     left: Int[Array, "size"]
     going: Int[Array, "size"]
