@@ -138,7 +138,7 @@ class Adapted(Env):
     def step(self, state: State, action: jax.Array) -> State:
         """One env step."""
         before = state.pipeline_state
-        after = self._env.step(before.data, jnp.clip(action, -1.0, 1.0))
+        after = jax.tree.map(jnp.asarray, self._env.step(before.data, jnp.clip(action, -1.0, 1.0)))
         steps = before.steps + 1
         going, finite = before.ended == 0, all_finite(after)
         cut = jnp.asarray(after.info.get("truncation", 0.0), jnp.float32) > 0

@@ -51,6 +51,9 @@ def _transposed(*rows: str) -> tuple[str, ...]:
     return tuple("".join(column) for column in zip(*rows, strict=True))
 
 
+# JaxGCRL's `ant` has no walls at all. These are out of the way, 28 m from the start.
+OPEN = Arena(rows=("1" * 9, *["100000001"] * 3, "1000r0001", *["100000001"] * 3, "1" * 9), cell=8.0)
+
 # JaxGCRL's mazes, whose first index is x: 4 m cells, success within .5 m, goals at the centres of the cells `g`.
 # U4 and U5 are of a later paper with its environments (Wang et al. 2025).
 

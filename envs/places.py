@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from envs.arena import FREE, GOAL, ROBOT, Arena
@@ -41,6 +42,13 @@ def box(lower: Point, upper: Point) -> Places:
 def point(*coordinates: float) -> Places:
     """Always the same point."""
     return box(coordinates, coordinates)
+
+
+def circle(radius: float, *, parts: int) -> Places:
+    """So many points on the circle of `radius` m around the origin, equally far apart, all alike."""
+    angles = (2 * math.pi * part / parts for part in range(parts))
+    found = tuple((radius * math.cos(angle), radius * math.sin(angle)) for angle in angles)
+    return Places(found, found)
 
 
 def centres(arena: Arena, symbols: str) -> Places:

@@ -15,7 +15,7 @@ from envs import arena as arenas
 from envs import layouts
 from envs.arena import BLOCK, CELL_SIZES, CHASM, FREE, GATE, GOAL, ROBOT, Arena
 from envs.options import EnvError, Option, choice, count, duration, number
-from envs.places import Places, Point, anywhere, around, box, centres, point, scaled
+from envs.places import Places, Point, anywhere, around, box, centres, circle, point, scaled
 
 INTEGRATORS = ("implicitfast", "euler", "rk4")
 SOLVERS = ("newton", "cg")
@@ -200,15 +200,16 @@ def maze(
     arena: Arena,
     *,
     goals: Mapping[str, Places] | None = None,
+    start: Places | None = None,
     geometry: Geometry | None = None,
     success_radius: float | None = None,
     clearance: float | None = None,
     **columns: Any,
 ) -> Task:
-    """A row over x and y. Unless told otherwise, goals and success are as on a map of the user's own.
+    """A row over x and y. Unless told otherwise, start, goals and success are as on a map of the user's own.
 
-    Training goals lie anywhere in the free cells. Test goals are the cells marked `g`, else the free cell that is
-    the longest walk away. Success is within 5/8 of a cell.
+    Starts are the cells marked `r`. Training goals lie anywhere in the free cells. Test goals are the cells marked
+    `g`, else the free cell that is the longest walk away. Success is within 5/8 of a cell.
     """
     clearance = CLEARANCE[body] if clearance is None else clearance
     free = anywhere(arena, clearance=clearance)
@@ -220,7 +221,7 @@ def maze(
         geometry=geometry or plane(arena),
         success_radius=0.625 * arena.cell if success_radius is None else success_radius,
         goals={**goals, "free": goals.get("free", free)},
-        starts={"task": centres(arena, ROBOT), "free": free},
+        starts={"task": start or centres(arena, ROBOT), "free": free},
         clearance=clearance,
         **columns,
     )
@@ -285,10 +286,18 @@ FALL_GEOMETRY = Geometry(
 )
 
 
-def _jaxgcrl(body: str, arena: Arena, test: Arena) -> Task:
-    goals = {"train": centres(arena, GOAL), "test": centres(test, GOAL)}
-    presets = ("fast", "published", "jaxgcrl")
-    return maze(body, arena, success_radius=0.5, goals=goals, defaults={"reward": "sparse"}, presets=presets)
+def _jaxgcrl(body: str, arena: Arena, train: Places, test: Places, start: Places | None = None) -> Task:
+    goals, presets = {"train": train, "test": test}, ("fast", "published", "jaxgcrl")
+    return maze(
+        body, arena, success_radius=0.5, goals=goals, start=start, defaults={"reward": "sparse"}, presets=presets
+    )
+
+
+def _jaxgcrl_maze(body: str, arena: Arena, test: Arena) -> Task:
+    return _jaxgcrl(body, arena, centres(arena, GOAL), centres(test, GOAL))
+
+
+AROUND, NEAR = circle(10.0, parts=180), box((-0.1, -0.1), (0.1, 0.1))  # of JaxGCRL's `ant`, which has no maze
 
 
 def _both(body: str) -> dict[str, Task]:
@@ -303,17 +312,18 @@ def _both(body: str) -> dict[str, Task]:
         f"{body}_2rooms": maze(body, layouts.ROOMS_2),
         f"{body}_3rooms": maze(body, layouts.ROOMS_3),
         f"{body}_4rooms": maze(body, layouts.ROOMS_4),
-        f"{body}_u_maze": _jaxgcrl(body, layouts.U_MAZE, layouts.U_MAZE_TEST),
-        f"{body}_u4_maze": _jaxgcrl(body, layouts.U4_MAZE, layouts.U4_MAZE_TEST),
-        f"{body}_u5_maze": _jaxgcrl(body, layouts.U5_MAZE, layouts.U5_MAZE_TEST),
-        f"{body}_big_maze": _jaxgcrl(body, layouts.BIG_MAZE, layouts.BIG_MAZE_TEST),
-        f"{body}_hardest_maze": _jaxgcrl(body, layouts.HARDEST_MAZE, layouts.HARDEST_MAZE),
+        f"{body}_u_maze": _jaxgcrl_maze(body, layouts.U_MAZE, layouts.U_MAZE_TEST),
+        f"{body}_u4_maze": _jaxgcrl_maze(body, layouts.U4_MAZE, layouts.U4_MAZE_TEST),
+        f"{body}_u5_maze": _jaxgcrl_maze(body, layouts.U5_MAZE, layouts.U5_MAZE_TEST),
+        f"{body}_big_maze": _jaxgcrl_maze(body, layouts.BIG_MAZE, layouts.BIG_MAZE_TEST),
+        f"{body}_hardest_maze": _jaxgcrl_maze(body, layouts.HARDEST_MAZE, layouts.HARDEST_MAZE),
     }
 
 
 TASKS: Mapping[str, Task] = {
     **_both("point"),
     **_both("ant"),
+    "ant_open": _jaxgcrl("ant", layouts.OPEN, AROUND, AROUND, start=NEAR),
     "ant_push": maze("ant", layouts.PUSH, goals={"train": point(0.0, 19.0), "test": point(0.0, 19.0)}),
     "ant_fall": maze("ant", layouts.FALL, geometry=FALL_GEOMETRY, goals=FALL_GOALS),
     "ant_maze_stochastic": maze(

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 import yaml
@@ -52,6 +53,27 @@ def test_the_check_of_the_physics_passes_and_notices_another_model(monkeypatch):
     assert script.one_step(batch)["one_step"] > 1e-3
     monkeypatch.setattr(Arena, "walls", Arena.free)
     assert script.throws(batch, 20) == 20  # everywhere is now a wall
+
+
+def test_the_check_against_jaxgcrl_gives_each_motor_its_own_action_and_counts_contacts():
+    script, env = load("checks/jaxgcrl"), envs.make("ant_open", preset="jaxgcrl", engine="native")
+    model, rng = env.body.physics.model, np.random.default_rng(0)
+    assert [model.actuator(i).name for i in script.MOTORS[:3]] == ["hip_4", "ankle_4", "hip_1"]  # its first motors
+    action, data = rng.uniform(-1, 1, (2, 8)).astype(np.float32), mujoco.MjData(model)
+    before = np.zeros((2, 29), np.float32)
+    before[:, :15] = data.qpos
+    before[:, 2] = [0.5, 1.2]
+    seen = script.Seen(before, np.zeros((2, 14), np.float32), action, before, np.zeros(2, bool))
+    after, done = script.stepped(env, seen)
+    assert done.tolist() == [False, True]
+    for i in range(2):
+        mujoco.mj_resetData(model, data)
+        data.qpos = before[i, :15]
+        data.ctrl[script.MOTORS] = 150 * action[i]
+        mujoco.mj_step(model, data, nstep=5)
+        np.testing.assert_allclose(after[i], [*data.qpos, *data.qvel], atol=1e-5)
+    before[1, 0] = 28.0
+    assert script.touching(model, before) == {"walls": 1, "itself": 0}
 
 
 def test_the_benchmark_measures_both_loops():

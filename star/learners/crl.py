@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -34,6 +34,7 @@ Metrics = dict[str, Array]
 
 LOG_STD = (-5.0, 2.0)  # of actions before tanh
 ENTROPY = -0.5  # wanted of each number of an action, nats
+VARIANCE = 1 / 3  # of an initial weight, times the inputs of its layer
 _LEAST = 1e-6
 
 
@@ -58,7 +59,7 @@ class CRLState(struct.PyTreeNode):
 
 
 def _mlp(config: CRLConfig, out: int) -> MLP:
-    return MLP(config.hidden, out, activation=nn.swish)
+    return MLP(config.hidden, out, activation=nn.swish, hidden_scale=(VARIANCE / 2) ** 0.5, final_scale=VARIANCE**0.5)
 
 
 def init(key: Array, config: CRLConfig, *, example: Transition) -> CRLState:
@@ -121,13 +122,29 @@ def update(
     rollout = devices.whole(rollout)
     ring = replay.add(state.ring, flatten(_step(rollout)))
     num_envs = rollout.weight.shape[1]
-    left = steps_left(ring, num_envs=num_envs)
+    future = Future.of(ring, num_envs=num_envs)
     state, metrics = jax.lax.scan(
-        partial(_one_update, config, left, num_envs, imitation),
+        partial(_one_update, config, future, imitation),
         state.replace(ring=ring),
         jax.random.split(key, config.updates_per_rollout),
     )
     return state, jax.tree.map(jnp.mean, metrics)
+
+
+class Future(NamedTuple):
+    """Items of a ring that others follow: the first `number` of `going`. `left` has the steps that follow each item."""
+
+    left: Int[Array, "size"]
+    going: Int[Array, "size"]
+    number: Int[Array, ""]
+    num_envs: int
+
+    @classmethod
+    def of(cls, ring: replay.Ring, *, num_envs: int) -> Future:
+        """That of the rollouts of `num_envs` environments in `ring`."""
+        left = steps_left(ring, num_envs=num_envs)
+        going = jnp.flatnonzero(left > 0, size=len(left), fill_value=0)
+        return cls(left, going, jnp.sum(left > 0), num_envs)
 
 
 def steps_left(ring: replay.Ring, *, num_envs: int) -> Int[Array, "size"]:
@@ -157,24 +174,22 @@ def ahead(left: Int[Array, "*n"], uniform: Float[Array, "*n"], *, discount: Arra
     return jnp.minimum(steps, left)
 
 
-def _drawn(
-    config: CRLConfig, ring: replay.Ring, left: Array, num_envs: int, key: Array
-) -> tuple[Step, Float[Array, "N k"]]:
-    """A batch, with weight 0 where no step follows, and its goals."""
+def _drawn(config: CRLConfig, ring: replay.Ring, future: Future, key: Array) -> tuple[Step, Float[Array, "N k"]]:
+    """A batch of steps that others follow, and its goals; without weight if there are none."""
     slot_key, ahead_key = jax.random.split(key)
     items, _ = replay.contents(ring)
-    slot = jax.random.randint(slot_key, (config.batch_size,), 0, jnp.maximum(replay.filled(ring), 1))
-    steps = ahead(left[slot], jax.random.uniform(ahead_key, slot.shape), discount=config.discount)
+    slot = future.going[jax.random.randint(slot_key, (config.batch_size,), 0, jnp.maximum(future.number, 1))]
+    steps = ahead(future.left[slot], jax.random.uniform(ahead_key, slot.shape), discount=config.discount)
     batch = jax.tree.map(lambda x: x[slot], items)
-    goal = items.track.place[(slot + steps * num_envs) % replay.capacity(ring)]
+    goal = items.track.place[(slot + steps * future.num_envs) % replay.capacity(ring)]
     return batch.replace(weight=batch.weight * (steps > 0)), goal
 
 
 def _one_update(
-    config: CRLConfig, left: Array, num_envs: int, imitation: Imitation | None, state: CRLState, key: Array
+    config: CRLConfig, future: Future, imitation: Imitation | None, state: CRLState, key: Array
 ) -> tuple[CRLState, Metrics]:
     draw_key, noise_key = jax.random.split(key)
-    batch, goal = devices.whole(_drawn(config, state.ring, left, num_envs, draw_key))
+    batch, goal = devices.whole(_drawn(config, state.ring, future, draw_key))
     ready = replay.filled(state.ring) >= config.min_transitions
     rate = config.learning_rate
 

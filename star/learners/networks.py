@@ -16,22 +16,28 @@ from jaxtyping import Array, Float
 class MLP(nn.Module):
     """Dense layers of the widths `hidden`, then a linear layer of width `out`.
 
-    `final_scale` multiplies the initial weights of the last layer: small values start a policy near zero.
+    Initial weights of a layer with n inputs have the variance 2 `hidden_scale`^2 / n, those of the last one
+    `final_scale`^2 / n: a small `final_scale` starts a policy near zero.
     """
 
     hidden: Sequence[int]
     out: int
     activation: Callable[[Array], Array] = nn.relu
+    hidden_scale: float = 1.0
     final_scale: float = 1.0
 
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
         """Apply the network to the last axis of `x`."""
+
         # Not orthogonal initialisation: its QR decomposition, batched over seeds, hangs jaxlib 0.10 on CPUs.
+        def dense(width: int, variance: float) -> nn.Dense:
+            normal = nn.initializers.variance_scaling(variance, "fan_in", "truncated_normal")
+            return nn.Dense(width, kernel_init=normal)
+
         for width in self.hidden:
-            x = self.activation(nn.Dense(width, kernel_init=nn.initializers.he_normal())(x))
-        small = nn.initializers.variance_scaling(self.final_scale**2, "fan_in", "truncated_normal")
-        return nn.Dense(self.out, kernel_init=small)(x)
+            x = self.activation(dense(width, 2 * self.hidden_scale**2)(x))
+        return dense(self.out, self.final_scale**2)(x)
 
 
 def apply(mlp: MLP, params: Any, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:

@@ -187,6 +187,14 @@ def test_a_step_that_is_not_finite_is_not_made_and_truncates():
     assert np.isfinite(states.reward).all()
 
 
+def test_a_state_may_hold_numbers_of_python():
+    def paid(self, state, action):
+        return Line.step(self, state, action).replace(done=0.0)
+
+    _, states = steps(envs.adapt(changed(step=paid), name="mine:paid"), [1.0, 1.0])
+    np.testing.assert_array_equal(states.obs[:, 0], [2.0, 3.0])
+
+
 def test_a_batch_starts_new_episodes_by_itself(line):
     batch = envs.VectorEnv(line, 3)
     state = jax.jit(batch.reset)(jax.random.key(1))

@@ -106,6 +106,16 @@ def test_jaxgcrl_mazes_keep_their_first_index_as_x():
     assert (big.success_radius, big.arena.cell) == (0.5, 4.0)
 
 
+def test_in_the_open_goals_lie_around_the_start_and_walls_far_off():
+    task = TASKS["ant_open"]
+    train, start = draws(task.goals["train"]), draws(task.starts["task"])
+    np.testing.assert_allclose(np.linalg.norm(train, axis=1), 10.0, rtol=1e-5)
+    angles = np.sort(np.arctan2(*train.T))
+    assert np.diff(angles).max() * 10.0 < 0.5, "goals leave no gap as wide as success"
+    assert 0.09 < np.abs(start).max() <= 0.1 and abs(start.mean()) < 0.01
+    assert np.abs(task.arena.walls()).max(axis=1).min() > 28.0 - 1e-6 and task.success_radius == 0.5
+
+
 def test_cells_of_another_size_scale_x_and_y_and_leave_heights():
     env = made("ant_fall", cell=4.0, goals="test")
     assert [corner.tolist() for corner in env.space] == [[-2.0, -2.0, 0.0], [6.0, 14.0, 8.0]]

@@ -71,6 +71,45 @@ def test_goals_lie_ahead_in_the_same_episode_also_where_the_buffer_has_begun_ane
     assert not found[len(kept) :].any() and found.max() > 2
 
 
+def test_it_draws_every_step_that_another_follows_and_its_goal_from_the_steps_that_follow():
+    rng, chosen = np.random.default_rng(5), settings(batch_size=96)
+    ring, steps = replay.create(crl._step(EXAMPLE), size=4 * LENGTH * ENVS), []
+    for number in range(3):  # a quarter of the buffer stays empty
+        one = crl._step(rollout(rng, epoch=number // 2))
+        ring = replay.add(ring, replay.flatten(one))
+        steps += [jax.tree.map(lambda x, t=t: x[t], one) for t in range(LENGTH)]
+    left = slow_left(steps)
+    goals = {  # of each step, which its first number tells, the places that it may be sent to
+        float(steps[t].obs[b, 0]): {tuple(steps[t + n].track.place[b]) for n in range(1, left[t, b] + 1)}
+        for t, b in np.argwhere(left)
+    }
+    draw = jax.jit(lambda key: crl._drawn(chosen, ring, crl.Future.of(ring, num_envs=ENVS), key))
+    seen = set()
+    for number in range(10):
+        batch, goal = draw(jax.random.key(number))
+        assert batch.weight.all()
+        for first, place in zip(batch.obs[:, 0].tolist(), np.asarray(goal), strict=True):
+            assert tuple(place) in goals[first]
+            seen.add(first)
+    assert seen == goals.keys()
+
+
+def test_a_buffer_in_which_nothing_follows_gives_a_batch_without_weight():
+    ring = replay.create(crl._step(EXAMPLE), size=4 * LENGTH * ENVS)
+    future = crl.Future.of(ring, num_envs=ENVS)
+    assert not crl._drawn(settings(), ring, future, jax.random.key(0))[0].weight.any()
+
+
+def test_networks_begin_with_weights_as_small_as_those_of_jaxgcrl():
+    """Its uniform weights have the variance 1 / 3n where a layer has n inputs."""
+    params = crl.init(jax.random.key(0), settings(hidden=[200, 200], representation=100), example=EXAMPLE).params
+    for layers in (params["actor"], params["critic"]["action"], params["critic"]["goal"]):
+        kernels = [layer["kernel"] for layer in layers["params"].values()]
+        assert len(kernels) == 3
+        for kernel in kernels[1:]:
+            assert float(kernel.var() * 3 * len(kernel)) == pytest.approx(1.0, rel=0.2)
+
+
 def test_how_far_goals_lie_ahead_is_geometric_and_cut_off_at_the_end():
     uniform = jax.random.uniform(jax.random.key(0), (20_000,))
     drawn = np.asarray(crl.ahead(jnp.full(uniform.shape, 5), uniform, discount=0.8))
