@@ -16,6 +16,7 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # nine of ten programs take less than 0.2
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # nobody reads where in our code an operation comes from
 
 from dataclasses import replace  # noqa: E402
 from types import SimpleNamespace  # noqa: E402
@@ -45,7 +46,7 @@ from tests.browser import program, started
 
 # What is imported and traced stays: to look through it for garbage again and again is a tenth of all time.
 gc.freeze()
-gc.set_threshold(20_000, 20, 100)
+gc.set_threshold(100_000, 20, 100)
 
 settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
 settings.load_profile("star")
