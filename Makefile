@@ -28,7 +28,7 @@ quickstart: $(VENV)/.run ## install into .venv, train on the Point Maze with ref
 	$(BIN)/python scripts/quickstart.py "$$dir" "$$dir-unrefined"
 
 test: lint ## lint, check the types, run the tests (PYTEST_ARGS=...)
-	$(BIN)/python -m mypy star envs
+	$(BIN)/python -m mypy --num-workers 2 star envs
 	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
 
 lint: $(VENV)/.$(TEST_EXTRAS) ## ruff: rules and formatting

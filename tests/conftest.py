@@ -16,6 +16,7 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # nine of ten programs take less than 0.2
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # nobody reads where in our code an operation comes from
 
 from dataclasses import replace  # noqa: E402
 from types import SimpleNamespace  # noqa: E402
@@ -45,7 +46,7 @@ from tests.browser import program, started
 
 # What is imported and traced stays: to look through it for garbage again and again is a tenth of all time.
 gc.freeze()
-gc.set_threshold(20_000, 20, 100)
+gc.set_threshold(100_000, 20, 100)
 
 settings.register_profile("star", deadline=None, derandomize=os.environ.get("CI") == "true")
 settings.load_profile("star")
@@ -118,19 +119,30 @@ class Fused:
 LONGEST = (
     "test_trainer.py",
     "test_docs.py",
-    "test_epoch.py",
     "test_strategies.py",
+    "test_epoch.py",
     "test_faults.py",
-    "test_wheel.py",
-    "test_acting.py",
     "test_scripts.py",
+    "test_wheel.py",
     "test_sweep.py",
-    "test_selection.py",
-    "test_play.py",
     "test_devices.py",
-    "test_tasks.py",
-    "test_refinement.py",
+    "test_selection.py",
+    "test_chime_runs.py",
+    "test_acting.py",
     "test_development.py",
+    "test_tasks.py",
+    "test_mistakes.py",
+    "test_play.py",
+    "test_exams.py",
+    "test_refinement.py",
+    "test_physics.py",
+    "test_sb3.py",
+    "test_films.py",
+    "test_crl.py",
+    "test_environment.py",
+    "test_td3.py",
+    "test_commander.py",
+    "test_gym.py",
 )
 
 

@@ -34,6 +34,12 @@ obs, info = env.reset(seed=0)
 for _ in range(20): obs, *_ = env.step(agent.act(obs))
 print(star.__file__, obs["achieved_goal"])
 """
+COMMANDS = """
+import sys
+from star.cli import main
+for command in sys.argv[1:]:
+    if code := main(command.split()): sys.exit(code)
+"""
 DRAW = "render ant_maze --out film.gif --steps 10 --every 5 --height 120 --quiet"
 
 
@@ -51,13 +57,12 @@ def main() -> None:
             path.chmod(0o777)
         user = Newcomer(work, site)
         print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB")
-        for words in (SMALL, "ls", "evaluate runs/mine --quiet --json", "report runs/mine --out report.html"):
-            user.star(words.split())
+        user.star(SMALL, "ls", "evaluate runs/mine --quiet --json", "report runs/mine --out report.html")
         # A script beside a folder `envs` would import that one, so it is run as a module is: from elsewhere.
         said = user.python(["-P", "-c", ACT])
         if not said.startswith(str(site)):
             raise SystemExit(f"star was imported from {said}")
-        if user.star(DRAW.split(), may_fail=("pictures need OpenGL", "MUJOCO_GL")):
+        if user.star(DRAW, may_fail=("pictures need OpenGL", "MUJOCO_GL")):
             print("drawn: film.gif")
 
 
@@ -72,14 +77,13 @@ class Newcomer:
         self._who = another() if os.geteuid() == 0 else {}
         print("as another user" if self._who else "as this user, in another home")
 
-    def star(self, words: Sequence[str], *, may_fail: Sequence[str] = ()) -> bool:
-        """Run a command as its console script does; False if it fails for one of the reasons that it may have."""
-        script = "import sys; from star.cli import main; sys.exit(main(sys.argv[1:]))"
-        done = self._run(["-P", "-c", script, *words])
+    def star(self, *commands: str, may_fail: Sequence[str] = ()) -> bool:
+        """Run commands in one process, as the console script does; False if one fails for a reason that it may have."""
+        done = self._run(["-P", "-c", COMMANDS, *commands])
         if done.returncode and any(reason in done.stderr for reason in may_fail):
-            print(f"star {words[0]}: {done.stderr.strip()}")
+            print(f"star {commands[0]}: {done.stderr.strip()}")
             return False
-        self._check(f"star {' '.join(words)}", done)
+        self._check("\n".join(f"star {command}" for command in commands), done)
         return True
 
     def python(self, words: Sequence[str]) -> str:
