@@ -6,8 +6,8 @@ A map has a row of characters for each row of cells:
     #  no floor        B  movable block    D  gate (door)
 
 The centre of the first robot's cell is the origin, +x runs right along a row, +y runs down the rows. Walls, blocks
-and gates are 4 m high whatever the size of the cells, so that no ant leaps over them. If a map has cells without floor,
-the floor of all others is raised by as much.
+and gates are 4 m high whatever the size of the cells, so that no ant leaps over them, but for walls of tasks that say
+otherwise. If a map has cells without floor, the floor of all others is raised by 4 m.
 """
 
 from __future__ import annotations
@@ -43,22 +43,19 @@ Cell = tuple[int, int]
 class Arena:
     """A maze. `rows` are strings of equal length, `cell` is the side of a cell in m.
 
-    `block` names the axes along which the blocks `B` slide: some of x, y and z; along z they fall.
+    `block` names the axes along which the blocks `B` slide: some of x, y and z; along z they fall. `wall_height` is
+    that of the walls above the floor, in m.
     """
 
     rows: tuple[str, ...]
     cell: float
     block: str = "xy"
+    wall_height: float = HEIGHT
 
     @cached_property
     def origin(self) -> Cell:
         """(row, column) of the first robot's cell."""
         return next(self.cells(ROBOT))
-
-    @property
-    def wall_height(self) -> float:
-        """Height of the walls above the floor, in m."""
-        return HEIGHT
 
     @cached_property
     def floor_height(self) -> float:

@@ -57,5 +57,6 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
         flip=chosen["flip"],
         fall=chosen["fall"],
         unhealthy=chosen["unhealthy"],
+        at_goal=chosen["at_goal"],
         position_noise=chosen["position_noise"],
     )

@@ -35,8 +35,9 @@ import numpy as np
 from scipy import stats
 
 import envs
-from envs.ant import MAX_TORQUE, QPOS
-from envs.arena import HEIGHT, Arena
+from envs.ant import QPOS
+from envs.arena import Arena
+from envs.tasks import TASKS
 
 TOLERANCE = {"native": 1e-5, "jax": 1e-3, "warp": 1e-3}
 P_VALUE = 1e-3
@@ -89,13 +90,20 @@ def one_step(batch: Batch) -> dict[str, Any]:
     frames = round(batch.env.dt / batch.model.opt.timestep)
     gaps = [
         np.abs(
-            mujoco_path(batch.model, start.qpos[i], start.qvel[i], MAX_TORQUE * action[None, i], frames)[0, :-2]
+            mujoco_path(batch.model, start.qpos[i], start.qvel[i], torque(batch.model) * action[None, i], frames)[
+                0, :-2
+            ]
             - after[i]
         )
         for i in range(n)
     ]
     worst = np.max(gaps, axis=0)
     return {"one_step": float(worst.max()), "one_step_at": int(worst.argmax())}
+
+
+def torque(model: mujoco.MjModel) -> float:
+    """What an action of 1 is, in N m."""
+    return float(model.actuator_ctrlrange[0, 1])
 
 
 def summaries(path: np.ndarray) -> np.ndarray:
@@ -117,7 +125,9 @@ def distributions(batch: Batch, rollouts: int, steps: int) -> dict[str, float]:
     frames = round(batch.env.dt / batch.model.opt.timestep)
 
     def plain(i: int) -> np.ndarray:
-        return summaries(mujoco_path(batch.model, start.qpos[i], start.qvel[i], MAX_TORQUE * actions[:, i], frames))
+        return summaries(
+            mujoco_path(batch.model, start.qpos[i], start.qvel[i], torque(batch.model) * actions[:, i], frames)
+        )
 
     with ThreadPoolExecutor() as pool:
         reference = np.array(list(pool.map(plain, range(n))))
@@ -152,7 +162,7 @@ def barred(batch: Batch, state: Any, n: int) -> np.ndarray:
 
 def top_of(arena: Arena) -> float:
     """Height of the walls' upper edges."""
-    return arena.floor_height + HEIGHT
+    return arena.floor_height + arena.wall_height
 
 
 def throws(batch: Batch, number: int) -> int:
@@ -228,7 +238,7 @@ def verify(task: str, options: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tasks", nargs="*", default=[name for name in envs.names() if name.startswith("ant_")])
+    parser.add_argument("tasks", nargs="*", default=[name for name in envs.names() if TASKS[name].body == "ant"])
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--reference", help="preset of the model that MuJoCo steps (default: the same)")
