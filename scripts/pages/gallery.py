@@ -12,18 +12,22 @@ import sys
 from pathlib import Path
 
 import envs
+from envs.tasks import TASKS
 from star import cli
 
 DOCS = Path(__file__).parents[2] / "docs"
 HEADING = "## Tasks\n"
-SETTINGS = "--steps 0 --height 340 --env.options.goals test"
+SETTINGS = "--steps 0 --env.options.goals test"
+HEIGHT, SMALL = 340, 200  # pixels; small are the mazes of other projects, of which many are alike
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", metavar="TASK")
     for name in parser.parse_args().tasks or envs.names():
-        code = cli.main(["render", name, "--out", str(DOCS / "images" / f"{name}.jpg"), *SETTINGS.split(), "--force"])
+        height = SMALL if TASKS[name].pairs else HEIGHT
+        settings = [*SETTINGS.split(), "--height", str(height), "--force"]
+        code = cli.main(["render", name, "--out", str(DOCS / "images" / f"{name}.jpg"), *settings])
         if code:
             return code
     page = DOCS / "gallery.md"
