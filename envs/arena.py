@@ -27,13 +27,12 @@ import yaml
 
 from envs.common import reading
 from envs.common.errors import Notice, shown
-from envs.options import EnvError
+from envs.options import CELL_SIZES, EnvError
 
 WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE = "10rg#BD"
 SYMBOLS = (WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE)
 HEIGHT = 4.0  # of walls, blocks, gates and the raised floor, in m
 MAX_CELLS = 64  # along a side
-CELL_SIZES = (1.5, 100.0)  # m
 BLOCK_AXES = ("x", "y", "xy", "yz", "xz", "xyz")
 
 Cell = tuple[int, int]

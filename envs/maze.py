@@ -26,9 +26,9 @@ from flax import struct
 from envs._quiet import Env, State
 from envs.arena import Arena
 from envs.common.errors import shown
-from envs.options import EnvError, known
+from envs.options import ENDS, EnvError, known
 from envs.places import Places
-from envs.tasks import ENDS, Switch, Task, on_map
+from envs.tasks import Switch, Task, on_map
 
 NEW_GOALS = 16  # drawn where one is wanted that is not reached yet
 

@@ -14,37 +14,11 @@ import numpy as np
 
 from envs import arena as arenas
 from envs import layouts
-from envs.arena import BLOCK, CELL_SIZES, CHASM, FREE, GATE, GOAL, ROBOT, Arena
-from envs.options import EnvError, Option, choice, count, duration, number
+from envs.arena import BLOCK, CHASM, FREE, GATE, GOAL, ROBOT, Arena
+from envs.options import ANT, COMMON, ENGINES, MAP, EnvError, Option, choice
 from envs.places import Places, Point, anywhere, around, box, centres, pairs, point, scaled
 
-INTEGRATORS = ("implicitfast", "euler", "rk4")
-SOLVERS = ("newton", "cg")
-CONES = ("pyramidal", "elliptic")
-ENGINES = ("auto", "native", "jax", "warp")
-ENDS = ("ignore", "terminate", "truncate")  # what a mishap may do to the episode
-AT_GOAL = (*ENDS, "new_goal")  # what success may do to it
 CLEARANCE = {"ant": 1.0, "point": 0.6}  # m that a body keeps from the sides of a cell when it starts anywhere
-
-# `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
-# MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both. `jaxgcrl` is the
-# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025).
-PRESETS: Mapping[str, Mapping[str, Any]] = {
-    "fast": {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 10},
-    "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},
-    "jaxgcrl": {
-        "model": "jaxgcrl",
-        "integrator": "euler",
-        "iterations": 1,
-        "ls_iterations": 4,
-        "timestep": 0.01,
-        "margin": 0.0,
-        "action_scale": 5.0,
-        "observe": "untimed",
-        "unhealthy": "terminate",
-        "episode_length": 1000,
-    },
-}
 
 
 @dataclass(frozen=True)
@@ -169,38 +143,6 @@ class Task:
         if self.body == "ant":
             options |= {**ANT, "preset": choice(*self.presets)}
         return options | {key: replace(options[key], default=value) for key, value in self.defaults.items()}
-
-
-MAP = Option(None, lambda value: isinstance(value, str) and bool(value), "the path of a map, or its rows")
-
-COMMON: Mapping[str, Option] = {
-    "episode_length": count(500, 100_000),
-    "observe": choice("published", "full"),
-    "reward": choice("distance", "sparse"),
-    "success_radius": number(None, 0.01, 100.0, "m"),
-    "cell": number(None, *CELL_SIZES, "m"),
-    "action_scale": number(1.0, 0.01, 10.0),
-    "position_noise": number(0.0, 0.0, 1.0, "m"),
-    "flip": choice(*ENDS),
-    "fall": choice(*ENDS),
-    "unhealthy": choice(*ENDS),
-    "at_goal": choice(*AT_GOAL),
-}
-
-ANT: Mapping[str, Option] = {
-    "observe": choice("published", "full", "untimed"),
-    "model": choice("published", "jaxgcrl", "gymnasium"),
-    "collisions": choice("all", "feet"),
-    "margin": number(0.01, 0.0, 0.1, "m"),
-    "wall_margin": number(0.0, 0.0, 0.1, "m"),
-    "timestep": duration(0.02, 1.0),
-    "frames": count(5, 1000),
-    "solver": choice(*SOLVERS),
-    "cone": choice(*CONES),
-    "integrator": replace(choice(*INTEGRATORS), default=None),  # None: that of the preset
-    "iterations": count(None, 10_000),
-    "ls_iterations": count(None, 10_000),
-}
 
 
 def plane(arena: Arena) -> Geometry:

@@ -193,7 +193,8 @@ def rollout(
             "action": action,
             "success": after.metrics["success"],
             "distance": after.metrics["distance"],
-            "terminated": after.done * (1 - after.info["truncation"]),
+            # who is taken off at the goal has lost nothing: that is bootstrapped like a time limit
+            "terminated": after.done * (1 - after.info["truncation"]) * (1 - after.metrics["success"]),
             "ended": after.done * (after.info["steps"] < length),
             "alive": alive,
             "non_finite": after.metrics["non_finite"],
