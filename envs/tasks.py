@@ -66,7 +66,7 @@ class Switch:
 
 @dataclass(frozen=True)
 class Motion:
-    """How a point moves, a square of side 2 `radius` m.
+    """The way a point moves, a square of side 2 `radius` m.
 
     An action of 1 commands `speed` m/s along an axis. An env step of `dt` s clips the point's own velocity to `limit`
     m/s along each axis, then takes on the share `response` of the commanded one.

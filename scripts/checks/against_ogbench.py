@@ -68,7 +68,7 @@ def fastest(env: Any, rng: np.random.Generator) -> tuple[tuple[float, np.ndarray
 
 
 def touches_wall(env: Any) -> bool:
-    """Whether the ant is in contact with a wall."""
+    """True if the ant is in contact with a wall."""
     names = [env.model.geom(int(i)).name for contact in env.data.contact for i in contact.geom]
     return any(name.startswith("block") for name in names)
 
@@ -111,7 +111,7 @@ def record(path: Path, seed: int) -> int:
 
 
 def steps(states: dict[str, np.ndarray], maze: str = MAZE) -> dict[str, np.ndarray]:
-    """What our env steps lead to: `after` [n, 15], `success`, `terminated` (bool [n])."""
+    """The ends of our env steps: `after` [n, 15], `success`, `terminated` (bool [n])."""
     import jax
     import jax.numpy as jnp
 

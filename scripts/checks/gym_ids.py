@@ -1,10 +1,10 @@
 """Gymnasium's own checker on every id of ours, and Stable-Baselines3 on one of them.
 
-    python scripts/checks/gym_ids.py [--steps 6000] [TASK ...]
+    python scripts/checks/gym_ids.py [--steps 3000] [TASK ...]
 
 Each environment is made with episodes of four env steps, an ant by MuJoCo in C. Pictures are not checked. Then SAC with
-hindsight (`pip install '.[sb3]'`) learns `star/pointmaze-arena-v0` with cells of 1.5 m for `--steps` env steps, and a line tells the
-success of its actions and of random ones over the same 30 episodes; `--steps 0` leaves it out.
+hindsight (`pip install '.[sb3]'`) learns `star/pointmaze-arena-v0` with cells of 1.5 m for `--steps` env steps. A line
+tells the success of its actions and of random ones over the same 30 episodes; `--steps 0` leaves it out.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ EPISODES = 30
 
 
 def check(name: str) -> str | None:
-    """What Gymnasium's checker says of the task `name`, None if nothing."""
+    """The complaint of Gymnasium's checker about the task `name`, None if it has none."""
     engine = {"engine": "native"} if TASKS[name].body == "ant" else {}
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # as Gymnasium's are

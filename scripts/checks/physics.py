@@ -103,7 +103,7 @@ def one_step(batch: Batch) -> dict[str, Any]:
 
 
 def torque(model: mujoco.MjModel) -> float:
-    """What an action of 1 is, in N m."""
+    """The torque of an action of 1, in N m."""
     return float(model.actuator_ctrlrange[0, 1])
 
 
