@@ -3,6 +3,7 @@
     state = qpos[0:15], qvel[0:14], t * .001      t in env steps
     start = qpos0 + U(-.1, .1), N(0, .1^2)        qpos0 has the torso .75 above the floor and every joint at 0
                                                   of model `jaxgcrl` .55, ankles bent by 1 rad, x and y without noise
+                                                  (.1 unless the task has another noise)
 
 qpos is x, y, z in m, a unit quaternion (w, x, y, z), then hip and ankle of legs 1 to 4 in rad; qvel is the velocity
 of the torso in m/s (world frame), its angular velocity in rad/s (body frame), then the 8 joint velocities. Actions
@@ -32,8 +33,6 @@ from envs.physics import Physics, PhysicsState
 from envs.tasks import Switch, Task
 
 MAX_TORQUE = 30.0  # N m
-START_POSITION = 0.1  # half-range of the start qpos, m and rad
-START_SPEED = 0.1  # standard deviation of the start qvel, m/s and rad/s
 STEP_SCALE = 0.001  # of the step count in the state
 ORIENTATION = (3, 4, 5, 6)  # indices of the quaternion in qpos and in the state
 VELOCITY = (15, 16)  # those in the state of the torso's velocity along x and y
@@ -57,7 +56,8 @@ def spec(*, action_scale: float = 1.0, collisions: str = "all", model: str = "pu
     """The ant's own model, without floor or walls. With `collisions="feet"` only torso and shins touch anything.
 
     `model="jaxgcrl"` has feet, which touch the floor, walls, torso and each other; torso and hips touch walls and feet
-    alone. Contacts have MuJoCo's own parameters, and joints are not damped implicitly.
+    alone. Contacts have MuJoCo's own parameters, and joints are not damped implicitly. `model="gymnasium"` has these
+    parameters and all else as published.
     """
     xml = resources.files("envs").joinpath("assets", "ant.xml").read_text(encoding="utf-8")
     ant = mujoco.MjSpec.from_string(xml)
@@ -66,6 +66,9 @@ def spec(*, action_scale: float = 1.0, collisions: str = "all", model: str = "pu
     for geom in ant.geoms:
         if collisions == "feet" and not geom.name.startswith(("torso", "shin")):
             geom.contype = 0
+    if model != "published":
+        for geom in (ant.default.geom, *ant.geoms):  # the default is that of floor and walls
+            geom.solimp = MUJOCO_SOLIMP
     if model == "jaxgcrl":
         _as_in_jaxgcrl(ant)
     return ant
@@ -74,11 +77,9 @@ def spec(*, action_scale: float = 1.0, collisions: str = "all", model: str = "pu
 def _as_in_jaxgcrl(ant: mujoco.MjSpec) -> None:
     """Turn the ant into that of JaxGCRL, but for the order of its motors."""
     ant.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    ant.default.geom.solimp = MUJOCO_SOLIMP  # of floor and walls
     for geom in ant.geoms:
         touching = geom.name.startswith(("torso", "hip"))
         geom.contype, geom.conaffinity = (scene.TORSO, 1) if touching else (0, 0)
-        geom.solimp = MUJOCO_SOLIMP
     for leg, (x, y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1)), start=1):
         ant.body(f"shin_{leg}").add_geom(
             name=f"foot_{leg}",
@@ -102,7 +103,8 @@ def build(task: Task, engine: str, options: Mapping[str, Any]) -> Ant:
         "ls_iterations": options["ls_iterations"],
     }
     own = {key: options[key] for key in ("action_scale", "collisions", "model")}
-    model = scene.build_model(task.arena, spec(**own), solver, margin=options["margin"])
+    margins = {key: options[key] for key in ("margin", "wall_margin")}
+    model = scene.build_model(task.arena, spec(**own), solver, **margins)
     physics = Physics(model, engine=engine, frames=options["frames"])
     return Ant(physics, task, **own, observed=options["observe"])
 
@@ -135,7 +137,9 @@ class Ant:
         self._closed = np.asarray(physics.mocap_pos)
         self._blocks = len(task.arena.centres(BLOCK))
         start = np.array(physics.model.qpos0)
-        self._shake = np.full(QPOS, START_POSITION, np.float32)
+        self._shake = np.full(QPOS, task.pose_noise, np.float32)
+        self._shake[:2] = task.place_noise
+        self._start_speed = task.pose_noise
         if model == "jaxgcrl":
             start[2], start[7:QPOS] = BENT
             self._shake[:2] = 0.0
@@ -158,7 +162,7 @@ class Ant:
         if self._block_noise:
             first_x = QPOS + len(self._arena.block) * np.arange(self._blocks)
             qpos = qpos.at[first_x].add(self._block_noise * jax.random.normal(block_rng, first_x.shape))
-        qvel = jnp.zeros(self.physics.model.nv).at[:QVEL].set(START_SPEED * jax.random.normal(qvel_rng, (QVEL,)))
+        qvel = jnp.zeros(self.physics.model.nv).at[:QVEL].set(self._start_speed * jax.random.normal(qvel_rng, (QVEL,)))
         return self.physics.init(qpos, qvel)
 
     def step(self, data: PhysicsState, action: jax.Array) -> PhysicsState:

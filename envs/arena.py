@@ -7,8 +7,8 @@ A map has a row of characters for each row of cells:
 
 A map of the user's own looks as it is written: +x runs right along a row, +y up from row to row. The centre of its
 lowest robot's cell, of several the leftmost, is the origin. Walls, blocks and gates are 4 m high whatever the size of
-the cells, so that no ant leaps over them. If a map has cells without floor, the floor of all others is raised by as
-much.
+the cells, so that no ant leaps over them, but for walls of tasks that say otherwise. If a map has cells without floor,
+the floor of all others is raised by 4 m.
 """
 
 from __future__ import annotations
@@ -28,13 +28,12 @@ import yaml
 
 from envs.common import reading
 from envs.common.errors import Notice, shown
-from envs.options import EnvError
+from envs.options import CELL_SIZES, EnvError
 
 WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE = "10rg#BD"
 SYMBOLS = (WALL, FREE, ROBOT, GOAL, CHASM, BLOCK, GATE)
 HEIGHT = 4.0  # of walls, blocks, gates and the raised floor, in m
 MAX_CELLS = 64  # along a side
-CELL_SIZES = (1.5, 100.0)  # m
 BLOCK_AXES = ("x", "y", "xy", "yz", "xz", "xyz")
 
 Cell = tuple[int, int]
@@ -44,22 +43,19 @@ Cell = tuple[int, int]
 class Arena:
     """A maze. `rows` are strings of equal length, from the lowest y up, `cell` is the side of a cell in m.
 
-    `block` names the axes along which the blocks `B` slide: some of x, y and z; along z they fall.
+    `block` names the axes along which the blocks `B` slide: some of x, y and z; along z they fall. `wall_height` is
+    that of the walls above the floor, in m.
     """
 
     rows: tuple[str, ...]
     cell: float
     block: str = "xy"
+    wall_height: float = HEIGHT
 
     @cached_property
     def origin(self) -> Cell:
         """(row, column) of the first robot's cell."""
         return next(self.cells(ROBOT))
-
-    @property
-    def wall_height(self) -> float:
-        """Height of the walls above the floor, in m."""
-        return HEIGHT
 
     @cached_property
     def floor_height(self) -> float:

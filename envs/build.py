@@ -8,8 +8,8 @@ from typing import Any
 from envs import ant, point, tasks
 from envs.common import modes
 from envs.maze import Body, MazeEnv
-from envs.options import EnvError, known, normal, resolve
-from envs.tasks import PRESETS, TASKS, Task
+from envs.options import PRESETS, EnvError, known, normal, resolve
+from envs.tasks import TASKS, Task
 
 BODIES: Mapping[str, Callable[[Task, str, Mapping[str, Any]], Body]] = {"ant": ant.build, "point": point.build}
 
@@ -57,5 +57,6 @@ def make(name: str, *, engine: str = "auto", **options: Any) -> MazeEnv:
         flip=chosen["flip"],
         fall=chosen["fall"],
         unhealthy=chosen["unhealthy"],
+        at_goal=chosen["at_goal"],
         position_noise=chosen["position_noise"],
     )

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from envs.arena import Arena
+from collections.abc import Mapping
+
+from envs.arena import Arena, Cell
+
+Pairs = tuple[tuple[Cell, Cell], ...]
 
 # The published tasks: 8 m cells.
 
@@ -89,3 +93,70 @@ HARDEST_MAZE = Arena(
     ),
     cell=4.0,
 )
+
+# OGBench's locomotion mazes (Park et al. 2025): 4 m cells, walls of 2 m. Pairs are the cells (row, column) of a start
+# and its goal; the open `arena` has one.
+
+ARENA = Arena(("11111111", "1r000001", *5 * ("10000001",), "11111111"), cell=4.0, wall_height=2.0)
+MEDIUM = Arena(
+    ("11111111", "1r011001", "10010001", "11000111", "10010001", "10100101", "10001001", "11111111"),
+    cell=4.0,
+    wall_height=2.0,
+)
+LARGE = Arena(
+    (
+        "111111111111",
+        "1r0001000001",
+        "101101010101",
+        "100000010001",
+        "101111011101",
+        "100101000001",
+        "110101010111",
+        "100100010001",
+        "111111111111",
+    ),
+    cell=4.0,
+    wall_height=2.0,
+)
+GIANT = Arena(
+    (
+        "1111111111111111",
+        "1r10000001100001",
+        "1010110101001101",
+        "1000100100010001",
+        "1011101111110101",
+        "1000100010000101",
+        "1110101001010111",
+        "1000100100010001",
+        "1010101111110101",
+        "1011100010001101",
+        "1000001000100001",
+        "1111111111111111",
+    ),
+    cell=4.0,
+    wall_height=2.0,
+)
+OGBENCH: Mapping[str, tuple[Arena, Pairs]] = {
+    "arena": (ARENA, (((1, 1), (6, 6)),)),
+    "medium": (
+        MEDIUM,
+        (((1, 1), (6, 6)), ((6, 1), (1, 6)), ((5, 3), (4, 2)), ((6, 5), (6, 1)), ((2, 6), (1, 1))),
+    ),
+    "large": (
+        LARGE,
+        (((1, 1), (7, 10)), ((5, 4), (7, 1)), ((7, 4), (1, 10)), ((3, 8), (5, 4)), ((1, 1), (5, 4))),
+    ),
+    "giant": (
+        GIANT,
+        (((1, 1), (10, 14)), ((1, 14), (10, 1)), ((8, 14), (1, 1)), ((8, 3), (5, 12)), ((5, 9), (3, 8))),
+    ),
+}
+
+# Gymnasium-Robotics' mazes, whose rows run up along y: cells of 4 m and walls of 2 m for the ant, of 1 m and .4 m for
+# the point.
+
+GYMNASIUM: Mapping[str, tuple[str, ...]] = {
+    "UMaze": ("11111", "10001", "11101", "1r001", "11111"),
+    "Medium": MEDIUM.rows[::-1],
+    "Large": LARGE.rows[::-1],
+}

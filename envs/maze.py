@@ -6,7 +6,8 @@
 
 An episode is truncated after `episode_length` steps, and at once if the simulator fails: a state that is not finite,
 contacts that were dropped. The observation then stays what it was. With `flip` it also ends when the body turns over,
-with `fall` when it lies in a gap, with `unhealthy` when it is too low or too high.
+with `fall` when it lies in a gap, with `unhealthy` when it is too low or too high, with `at_goal` upon success. With
+`at_goal="new_goal"` it goes on from there with another goal, which is the next observation's.
 An episode that has ended before its time stays as it is until the next reset.
 """
 
@@ -25,9 +26,11 @@ from flax import struct
 from envs._quiet import Env, State
 from envs.arena import Arena
 from envs.common.errors import shown
-from envs.options import EnvError, known
+from envs.options import ENDS, EnvError, known
 from envs.places import Places
-from envs.tasks import ENDS, Switch, Task, on_map
+from envs.tasks import Switch, Task, on_map
+
+NEW_GOALS = 16  # drawn where one is wanted that is not reached yet
 
 
 class Body(Protocol):
@@ -77,7 +80,7 @@ class Body(Protocol):
 
 
 class Simulation(struct.PyTreeNode):
-    """The body's data, the env steps since the last reset (int32), and the key of the noise on positions (raw).
+    """The body's data, the env steps since the last reset (int32), and the key of noise and new goals (raw).
 
     `ended` is 1.0 if the episode has ended before its time, `terminated` 1.0 if the task ended it.
     """
@@ -109,6 +112,7 @@ class MazeEnv(Env):
         flip: str = "ignore",
         fall: str = "ignore",
         unhealthy: str = "ignore",
+        at_goal: str = "ignore",
         position_noise: float = 0.0,
     ):
         """`task` is a row of the registry; the other arguments are options of docs/environments.md."""
@@ -128,10 +132,12 @@ class MazeEnv(Env):
         self.region_cuts = geometry.region_cuts
         self.subgoal_scale = geometry.subgoal_scale
         self._body = body
-        self._goals = task.goals[goals]
+        self._goals = task.pairs[goals] if goals in task.pairs else task.goals[goals]
+        self._paired = goals in task.pairs and start == "task"
         self._starts = task.starts[start]
         self._sparse = reward == "sparse"
         self._ends = {"flipped": flip, "fallen": fall, "unhealthy": unhealthy}
+        self._at_goal = at_goal
         self._position_noise = position_noise
 
     @classmethod
@@ -243,8 +249,8 @@ class MazeEnv(Env):
         """A new episode with a new goal; `rng` is a typed or a raw key."""
         body_rng, goal_rng, start_rng, noise_rng = jax.random.split(rng, 4)
         steps = jnp.zeros((), jnp.int32)
-        data = self._body.init(body_rng, sample(self._starts, start_rng))
-        goal = self.draw_goal(goal_rng)
+        place, goal = self._drawn(start_rng, goal_rng)
+        data = self._body.init(body_rng, place)
         obs = jnp.concatenate([self._body.observe(data, steps), goal])
         noise = noise_rng if jnp.issubdtype(noise_rng.dtype, jnp.uint32) else jax.random.key_data(noise_rng)
         zero = jnp.zeros(())
@@ -259,7 +265,14 @@ class MazeEnv(Env):
 
     def draw_goal(self, rng: jax.Array) -> jax.Array:
         """A desired goal [k], as an episode may have."""
-        return sample(self._goals, rng)
+        return sample(self._goals, rng)[-len(self.goal_indices) :]
+
+    def _drawn(self, start_rng: jax.Array, goal_rng: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The place [2] of a start, and a desired goal [k]."""
+        if self._paired:
+            both = sample(self._goals, goal_rng)
+            return both[:2], both[2:]
+        return sample(self._starts, start_rng), self.draw_goal(goal_rng)
 
     def with_goal(self, state: State, goal: jax.Array) -> State:
         """`state`, at the start of an episode, with another desired goal [k]."""
@@ -270,18 +283,22 @@ class MazeEnv(Env):
     def step(self, state: State, action: jax.Array) -> State:
         """One env step of `dt` seconds; `action` [action_size] is clipped to [-1, 1]."""
         before = state.pipeline_state
-        data, noise = self._shaken(self._body.step(before.data, jnp.clip(action, -1.0, 1.0)), before.noise)
+        noise, now = before.noise, None
+        if self._position_noise or self._at_goal == "new_goal":
+            noise, now = jax.random.split(noise)
+        data = self._shaken(self._body.step(before.data, jnp.clip(action, -1.0, 1.0)), now)
         steps = before.steps + 1
         seen = self._body.observe(data, steps)
         non_finite = ~(all_finite(data) & jnp.isfinite(seen).all())
         overflow = ~non_finite & self._body.dropped(data)
         mishaps = {name: ~non_finite & getattr(self._body, name)(data) for name in self._ends}
         going, failed = before.ended == 0, non_finite | overflow
-        terminated = (before.terminated > 0) | (going & ~failed & self._ended_by(mishaps, "terminate"))
-        ended = ~going | failed | terminated | self._ended_by(mishaps, "truncate")
-        done = ended | (steps >= self.episode_length)
         obs = jnp.where(going & ~failed, jnp.concatenate([seen, state.info["goal"]]), state.obs)
-        metrics = self._metrics(obs) | {
+        told = self._metrics(obs)
+        terminated = (before.terminated > 0) | (going & ~failed & self._ended_by(mishaps, told, "terminate"))
+        ended = ~going | failed | terminated | self._ended_by(mishaps, told, "truncate")
+        done = ended | (steps >= self.episode_length)
+        metrics = told | {
             "non_finite": (going & non_finite).astype(jnp.float32),
             "overflow": (going & overflow).astype(jnp.float32),
             **{name: happened.astype(jnp.float32) for name, happened in mishaps.items()},
@@ -289,6 +306,7 @@ class MazeEnv(Env):
         info = {
             "steps": steps.astype(state.info["steps"].dtype),
             "truncation": (done & ~terminated).astype(jnp.float32),
+            "goal": self._next_goal(state.info["goal"], obs, going & ~failed & (told["success"] > 0), now),
         }
         flags = {"ended": ended.astype(jnp.float32), "terminated": terminated.astype(jnp.float32)}
         return state.replace(
@@ -300,16 +318,24 @@ class MazeEnv(Env):
             info={**state.info, **info},
         )
 
-    def _ended_by(self, mishaps: dict[str, jax.Array], how: str) -> jax.Array:
-        """True if one of `mishaps` is to end the episode by `how`."""
-        return jnp.any(jnp.stack([happened & (self._ends[name] == how) for name, happened in mishaps.items()]))
+    def _ended_by(self, mishaps: dict[str, jax.Array], told: dict[str, jax.Array], how: str) -> jax.Array:
+        """True if one of `mishaps`, or the success `told` of, is to end the episode by `how`."""
+        reached = (told["success"] > 0) & (self._at_goal == how)
+        return jnp.any(jnp.stack([reached, *(mishaps[name] & (self._ends[name] == how) for name in mishaps)]))
 
-    def _shaken(self, data: Any, noise: jax.Array) -> tuple[Any, jax.Array]:
-        """`data` with noise on the body's position, and the next key."""
-        if not self._position_noise:
-            return data, noise
-        noise, now = jax.random.split(noise)
-        return self._body.displace(data, self._position_noise * jax.random.normal(now, (2,))), noise
+    def _next_goal(self, goal: jax.Array, obs: jax.Array, reached: jax.Array, rng: jax.Array | None) -> jax.Array:
+        """The desired goal [k] of the next env step: under `new_goal`, if `reached`, another one that is not yet."""
+        if self._at_goal != "new_goal" or rng is None:
+            return goal
+        others = jax.vmap(self.draw_goal)(jax.random.split(jax.random.fold_in(rng, 1), NEW_GOALS))
+        far = _distance(obs[np.asarray(self.goal_indices)], others) >= self.success_radius
+        return jnp.where(reached, others[jnp.argmax(far)], goal)
+
+    def _shaken(self, data: Any, rng: jax.Array | None) -> Any:
+        """`data` with noise on the body's position."""
+        if not self._position_noise or rng is None:
+            return data
+        return self._body.displace(data, self._position_noise * jax.random.normal(rng, (2,)))
 
     def _metrics(self, obs: jax.Array) -> dict[str, jax.Array]:
         distance = _distance(obs[np.asarray(self.goal_indices)], obs[self.state_dim :])

@@ -1,16 +1,44 @@
-"""Options of the tasks: what each may be, and the one error that says what was wrong."""
+"""Options of the tasks: what each may be, presets of them, and the one error that says what was wrong."""
 
 from __future__ import annotations
 
 import difflib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from envs.common import plugins
 from envs.common.errors import UserError, shown, where_raised
 from envs.common.plainly import plain
+
+INTEGRATORS = ("implicitfast", "euler", "rk4")
+SOLVERS = ("newton", "cg")
+CONES = ("pyramidal", "elliptic")
+ENGINES = ("auto", "native", "jax", "warp")
+ENDS = ("ignore", "terminate", "truncate")  # what a mishap may do to the episode
+CELL_SIZES = (1.5, 100.0)  # m
+AT_GOAL = (*ENDS, "new_goal")  # what success may do to it
+
+# `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
+# MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both. `jaxgcrl` is the
+# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025).
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "fast": {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 10},
+    "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},
+    "jaxgcrl": {
+        "model": "jaxgcrl",
+        "integrator": "euler",
+        "iterations": 1,
+        "ls_iterations": 4,
+        "timestep": 0.01,
+        "margin": 0.0,
+        "action_scale": 5.0,
+        "observe": "untimed",
+        "unhealthy": "terminate",
+        "episode_length": 1000,
+    },
+}
 
 
 class EnvError(UserError):
@@ -50,6 +78,38 @@ def number(default: float | None, low: float, high: float, unit: str = "") -> Op
     """A number from `low` to `high`."""
     words = f"a number from {low:g} to {high:g}" + (f" {unit}" if unit else "")
     return Option(default, lambda value: type(value) in (int, float) and low <= value <= high, words)
+
+
+MAP = Option(None, lambda value: isinstance(value, str) and bool(value), "the path of a map, or its rows")
+
+COMMON: Mapping[str, Option] = {
+    "episode_length": count(500, 100_000),
+    "observe": choice("published", "full"),
+    "reward": choice("distance", "sparse"),
+    "success_radius": number(None, 0.01, 100.0, "m"),
+    "cell": number(None, *CELL_SIZES, "m"),
+    "action_scale": number(1.0, 0.01, 10.0),
+    "position_noise": number(0.0, 0.0, 1.0, "m"),
+    "flip": choice(*ENDS),
+    "fall": choice(*ENDS),
+    "unhealthy": choice(*ENDS),
+    "at_goal": choice(*AT_GOAL),
+}
+
+ANT: Mapping[str, Option] = {
+    "observe": choice("published", "full", "untimed"),
+    "model": choice("published", "jaxgcrl", "gymnasium"),
+    "collisions": choice("all", "feet"),
+    "margin": number(0.01, 0.0, 0.1, "m"),
+    "wall_margin": number(0.0, 0.0, 0.1, "m"),
+    "timestep": duration(0.02, 1.0),
+    "frames": count(5, 1000),
+    "solver": choice(*SOLVERS),
+    "cone": choice(*CONES),
+    "integrator": replace(choice(*INTEGRATORS), default=None),  # None: that of the preset
+    "iterations": count(None, 10_000),
+    "ls_iterations": count(None, 10_000),
+}
 
 
 def normal(given: Mapping[str, Any]) -> dict[str, Any]:

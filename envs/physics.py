@@ -66,7 +66,7 @@ class Physics:
     """
 
     def __init__(self, model: mujoco.MjModel, *, engine: str, frames: int):
-        """`engine` is one of `tasks.ENGINES`; raises `EnvError` if this machine plainly lacks what it needs."""
+        """`engine` is one of `options.ENGINES`; raises `EnvError` if this machine plainly lacks what it needs."""
         if engine == "warp":
             _require(nvidia=os.path.exists("/proc/driver/nvidia") or os.path.exists("/dev/nvidia0"))
         self.model = model
@@ -114,7 +114,7 @@ def _without_derivatives(step: StepBatch, engine: str) -> StepBatch:
 
 
 def resolve_engine(engine: str) -> str:
-    """The engine to use on this machine: for `auto` the fastest, else `engine` itself, one of `tasks.ENGINES`.
+    """The engine to use on this machine: for `auto` the fastest, else `engine` itself, one of `options.ENGINES`.
 
     Raises:
       EnvError: if the package or the device that `warp` needs is missing.

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-from envs.arena import FREE, GOAL, ROBOT, Arena
+from envs.arena import FREE, GOAL, ROBOT, Arena, Cell
 
 Point = tuple[float, ...]
 
@@ -21,17 +22,17 @@ class Places:
     lower: tuple[Point, ...]
     upper: tuple[Point, ...]
 
-    def resized(self, ratio: float) -> Places:
-        """All places `ratio` times as far from the origin in x and y."""
+    def resized(self, ratio: float, *, dims: int = 2) -> Places:
+        """All places `ratio` times as far from the origin in their first `dims` coordinates; a pair has 4."""
         return Places(
-            tuple(scaled(corner, ratio) for corner in self.lower),
-            tuple(scaled(corner, ratio) for corner in self.upper),
+            tuple(scaled(corner, ratio, dims=dims) for corner in self.lower),
+            tuple(scaled(corner, ratio, dims=dims) for corner in self.upper),
         )
 
 
-def scaled(point: Point, ratio: float) -> Point:
-    """`point` with x and y, its first two coordinates, `ratio` times as large."""
-    return (ratio * point[0], ratio * point[1], *point[2:])
+def scaled(point: Point, ratio: float, *, dims: int = 2) -> Point:
+    """`point` with its first `dims` coordinates, by default x and y, `ratio` times as large."""
+    return (*(ratio * x for x in point[:dims]), *point[dims:])
 
 
 def box(lower: Point, upper: Point) -> Places:
@@ -64,6 +65,15 @@ def around(arena: Arena, symbols: str, *, clearance: float, height: Point = ()) 
     return Places(
         tuple((x - half, y - half, *height) for x, y in found), tuple((x + half, y + half, *height) for x, y in found)
     )
+
+
+def pairs(arena: Arena, cells: Iterable[tuple[Cell, Cell]], *, noise: float) -> Places:
+    """Starts and their goals (x, y, x, y) from pairs of cells, all alike.
+
+    Each lies within `noise` m of the centre of its cell, along x and along y.
+    """
+    centres = [(*arena.centre(start), *arena.centre(goal)) for start, goal in cells]
+    return Places(*(tuple(tuple(x + side for x in centre) for centre in centres) for side in (-noise, noise)))
 
 
 def anywhere(arena: Arena, *, clearance: float) -> Places:

@@ -3,8 +3,9 @@
     v' = .7 v + .3 max_speed a      a in [-1, 1]^2 is the commanded velocity over max_speed
     x' = x + dt v'                  stopped by walls and closed gates, first along x, then along y
 
-A stop along an axis sets the velocity along it to 0. The move along an axis is limited by the
-nearest wall ahead, whatever its length, so the body cannot jump through a wall.
+Some tasks have numbers other than .7 and .3, and a limit on v: `tasks.Motion`. A stop along an axis sets the velocity
+along it to 0. The move along an axis is limited by the nearest wall ahead, whatever its length, so the body cannot jump
+through a wall.
 """
 
 from __future__ import annotations
@@ -19,12 +20,6 @@ from flax import struct
 
 from envs.arena import HEIGHT
 from envs.tasks import Switch, Task
-
-MAX_SPEED = 4.0  # m/s along each axis
-RADIUS = 0.5  # m, half the side of the square
-RESPONSE = 0.3  # share of the commanded velocity taken on in one step
-START_POSITION = 0.1  # m, half-range of the start position
-START_SPEED = 0.1  # m/s, standard deviation of the start velocity
 
 
 class PointState(struct.PyTreeNode):
@@ -46,36 +41,40 @@ class Point:
     action_size = 2
     orientation: tuple[int, ...] = ()
     velocity: tuple[int, ...] = ()
-    dt = 0.1
     engine = "jax"
 
     def __init__(self, task: Task, *, action_scale: float = 1.0, full: bool = False):
         """Live among the walls and gates of the task's arena."""
+        self._motion = task.motion
+        self._place_noise, self._start_speed = task.place_noise, task.pose_noise
+        self.dt = task.motion.dt
         walls, gates = task.arena.walls(), task.arena.gates()
-        grown = np.concatenate([walls, gates]) + RADIUS * np.array([-1, -1, 1, 1])
+        grown = np.concatenate([walls, gates]) + task.motion.radius * np.array([-1, -1, 1, 1])
         self._lower = np.asarray(grown[:, :2], np.float32)
         self._upper = np.asarray(grown[:, 2:], np.float32)
         self._is_gate = np.arange(len(grown)) >= len(walls)
         self._gates = len(gates)
         self._arena = task.arena
         self._switch: Switch | None = task.switch
-        self._max_speed = action_scale * MAX_SPEED
+        self._max_speed = action_scale * task.motion.speed
         self._full = full
         self.state_dim = 4 + self._gates * full
 
     def init(self, rng: jax.Array, position: jax.Array) -> PointState:
         """A start near `position` [2], nearly at rest."""
         position_rng, velocity_rng = jax.random.split(rng)
-        noise = jax.random.uniform(position_rng, (2,), minval=-START_POSITION, maxval=START_POSITION)
+        noise = jax.random.uniform(position_rng, (2,), minval=-self._place_noise, maxval=self._place_noise)
         return PointState(
             position=position + noise,
-            velocity=START_SPEED * jax.random.normal(velocity_rng, (2,)),
+            velocity=self._start_speed * jax.random.normal(velocity_rng, (2,)),
             open=jnp.zeros(()),
         )
 
     def step(self, data: PointState, action: jax.Array) -> PointState:
         """Move for `dt` seconds, then open the gates if it is time; `action` [2] in [-1, 1]."""
-        velocity = (1 - RESPONSE) * data.velocity + RESPONSE * self._max_speed * action
+        response, limit = self._motion.response, self._motion.limit
+        before = jnp.clip(data.velocity, -limit, limit)
+        velocity = (1 - response) * before + response * self._max_speed * action
         moved, stopped = self._move(data, self.dt * velocity)
         is_open = data.open
         if self._switch is not None:
@@ -113,10 +112,10 @@ class Point:
 
         from envs import scene
 
-        spec = mujoco.MjSpec()
-        body = spec.worldbody.add_body(name="point", pos=[0, 0, RADIUS])
+        spec, radius = mujoco.MjSpec(), self._motion.radius
+        body = spec.worldbody.add_body(name="point", pos=[0, 0, radius])
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX, size=[RADIUS] * 3, rgba=(0.8, 0.6, 0.4, 1.0), contype=0, conaffinity=0
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=[radius] * 3, rgba=(0.8, 0.6, 0.4, 1.0), contype=0, conaffinity=0
         )
         for name in ("x", "y"):
             body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=scene.AXES[name])

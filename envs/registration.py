@@ -17,8 +17,9 @@ from envs.tasks import names
 
 
 def gym_id(task: str) -> str:
-    """Gymnasium's id of a task: `ant_2rooms` is `star/Ant2Rooms-v0`."""
-    return f"star/{task.title().replace('_', '')}-v0"
+    """Gymnasium's id of a task: `ant_2rooms` is `star/Ant2Rooms-v0`; names with `-` or capitals stay as they are."""
+    kept = "-" in task or not task.islower()
+    return f"star/{task if kept else task.title().replace('_', '')}-v0"
 
 
 def register() -> None:

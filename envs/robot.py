@@ -27,9 +27,8 @@ from envs import scene
 from envs.arena import Arena
 from envs.common import reading
 from envs.maze import uprightness
-from envs.options import EnvError, known
+from envs.options import ENGINES, EnvError, known
 from envs.physics import Physics, PhysicsState
-from envs.tasks import ENGINES
 
 ON_ITS_BACK = -0.5  # the robot is flipped when the vertical part of its own up axis is below
 

@@ -8,8 +8,8 @@
 
 Geoms that stand still have contype 0 and conaffinity 1, so that they never meet each other. Walls and gates also meet
 contype 2, for a torso that the floor lets through. All take the contact parameters of the body's default class, but
-for margins: contacts with the plane begin `margin` above it, those with boxes where they touch, since that is where
-MJX begins them between capsule and box.
+for margins: contacts with the plane begin `margin` above it, those with walls and gates `wall_margin` before them,
+those with other boxes where they touch. Without a margin is where MJX begins them between capsule and box.
 
 Boxes of 8 m that lie on each other are missed now and then by MJX-Warp, spheres on boxes are not. Since no wall is
 narrower than a block, its corners meet all that it would meet. A block that falls begins a tenth of a millimetre
@@ -52,10 +52,12 @@ def build_model(
     options: Mapping[str, Any],
     *,
     margin: float = PLANE_MARGIN,
+    wall_margin: float = 0.0,
     visual: bool = False,
 ) -> Any:
-    """The `MjModel` of `body` in `arena`. `options` are attributes of `MjSpec.option`, `margin` is the plane's (m).
+    """The `MjModel` of `body` in `arena`. `options` are attributes of `MjSpec.option`.
 
+    `margin` is the plane's, `wall_margin` that of walls and gates (m).
     The joints of `body` come first, then the slides of the blocks in the order of x, y, z. With `visual` the floor
     has a checkered texture and the walls of small cells are lower; places and joints are the same.
     """
@@ -79,13 +81,13 @@ def build_model(
         for i, rectangle in enumerate(arena.floors())
         if arena.floor_height
     ]
-    top = arena.floor_height + (min(HEIGHT, arena.cell / 2) if visual else HEIGHT)
+    top = arena.floor_height + (min(arena.wall_height, arena.cell / 2) if visual else arena.wall_height)
     for i, rectangle in enumerate(arena.walls()):
-        _box(world, f"wall_{i}", rectangle, 0.0, top, WALL_COLOUR)
+        _box(world, f"wall_{i}", rectangle, 0.0, top, WALL_COLOUR).margin = wall_margin
     for i, centre in enumerate(arena.centres(BLOCK)):
         _add_block(world, f"block_{i}", centre, arena)
     for i, rectangle in enumerate(arena.gates()):
-        _add_gate(world, f"gate_{i}", rectangle, arena)
+        _add_gate(world, f"gate_{i}", rectangle, arena).margin = wall_margin
     if visual:
         _checker(body, [floor, *floors], cell=arena.cell)
     return body.compile()
@@ -142,10 +144,12 @@ def _add_block(world: Any, name: str, centre: np.ndarray, arena: Arena) -> None:
         )
 
 
-def _add_gate(world: Any, name: str, rectangle: np.ndarray, arena: Arena) -> None:
+def _add_gate(world: Any, name: str, rectangle: np.ndarray, arena: Arena) -> Any:
     centre, half = (rectangle[:2] + rectangle[2:]) / 2, (rectangle[2:] - rectangle[:2]) / 2
     body = world.add_body(name=name, mocap=True, pos=[*centre, arena.floor_height + HEIGHT / 2])
-    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, HEIGHT / 2], rgba=GATE_COLOUR, **UPRIGHT)
+    return body.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=[*half, HEIGHT / 2], rgba=GATE_COLOUR, **UPRIGHT
+    )
 
 
 def _checker(spec: mujoco.MjSpec, floors: list[Any], *, cell: float) -> None:

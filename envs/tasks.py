@@ -5,6 +5,7 @@ A row is written in m at the row's own size of cells; `Task.resized` scales its 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,36 +14,11 @@ import numpy as np
 
 from envs import arena as arenas
 from envs import layouts
-from envs.arena import BLOCK, CELL_SIZES, CHASM, FREE, GATE, GOAL, ROBOT, Arena
-from envs.options import EnvError, Option, choice, count, duration, number
-from envs.places import Places, Point, anywhere, around, box, centres, circle, point, scaled
+from envs.arena import BLOCK, CHASM, FREE, GATE, GOAL, ROBOT, Arena
+from envs.options import ANT, COMMON, ENGINES, MAP, EnvError, Option, choice
+from envs.places import Places, Point, anywhere, around, box, centres, circle, pairs, point, scaled
 
-INTEGRATORS = ("implicitfast", "euler", "rk4")
-SOLVERS = ("newton", "cg")
-CONES = ("pyramidal", "elliptic")
-ENGINES = ("auto", "native", "jax", "warp")
-ENDS = ("ignore", "terminate", "truncate")  # what a mishap may do to the episode
 CLEARANCE = {"ant": 1.0, "point": 0.6}  # m that a body keeps from the sides of a cell when it starts anywhere
-
-# `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
-# MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both. `jaxgcrl` is the
-# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025).
-PRESETS: Mapping[str, Mapping[str, Any]] = {
-    "fast": {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 10},
-    "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},
-    "jaxgcrl": {
-        "model": "jaxgcrl",
-        "integrator": "euler",
-        "iterations": 1,
-        "ls_iterations": 4,
-        "timestep": 0.01,
-        "margin": 0.0,
-        "action_scale": 5.0,
-        "observe": "untimed",
-        "unhealthy": "terminate",
-        "episode_length": 1000,
-    },
-}
 
 
 @dataclass(frozen=True)
@@ -89,13 +65,31 @@ class Switch:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """The way a point moves, a square of side 2 `radius` m.
+
+    An action of 1 commands `speed` m/s along an axis. An env step of `dt` s clips the point's own velocity to `limit`
+    m/s along each axis, then takes on the share `response` of the commanded one.
+    """
+
+    radius: float = 0.5
+    speed: float = 4.0
+    response: float = 0.3
+    dt: float = 0.1
+    limit: float = float("inf")
+
+
+@dataclass(frozen=True)
 class Task:
     """A row of the registry.
 
-    `goals` names the distributions of the desired goal, the first being the default; `starts` those of the body's
-    position (x, y). `block_noise` is the standard deviation, in m, of a block's start along x. `defaults` are
+    `goals` names the distributions of the desired goal, `starts` those of the body's position (x, y). `pairs` names
+    those of goals that have a start of their own (x, y, x, y), which the start `task` then is. The first of pairs and
+    goals is the default. `place_noise` is the half-range in m of what is added to the start's x and y, `pose_noise` the
+    scale of what is added to the rest of a body's position (half-range) and to its velocity (standard deviation), in
+    their units. `block_noise` is the standard deviation, in m, of a block's start along x. `defaults` are
     options whose default is not the usual one, `maps` tells whether a map of the user's own may take the row's place.
-    `presets` are those of an ant.
+    `presets` are those of an ant, `motion` is that of a point.
     `clearance` is what the body keeps from the sides of a cell where it may start anywhere, in m.
     """
 
@@ -106,7 +100,11 @@ class Task:
     goals: Mapping[str, Places]
     starts: Mapping[str, Places]
     clearance: float
+    pairs: Mapping[str, Places] = field(default_factory=dict)
     switch: Switch | None = None
+    place_noise: float = 0.1
+    pose_noise: float = 0.1
+    motion: Motion = Motion()
     block_noise: float = 0.0
     defaults: Mapping[str, Any] = field(default_factory=dict)
     maps: bool = False
@@ -126,6 +124,7 @@ class Task:
             geometry=self.geometry.resized(ratio),
             goals={name: follow(places) for name, places in self.goals.items()},
             starts={name: follow(places) for name, places in self.starts.items()},
+            pairs={name: places.resized(ratio, dims=4) for name, places in self.pairs.items()},
             switch=self.switch and self.switch.resized(ratio),
             success_radius=ratio * self.success_radius,
             block_noise=ratio * self.block_noise,
@@ -138,7 +137,7 @@ class Task:
 
     def options(self) -> dict[str, Option]:
         """The options of the task with their defaults."""
-        options = {"goals": choice(*self.goals), "start": choice(*self.starts), **COMMON}
+        options = {"goals": choice(*self.pairs, *self.goals), "start": choice(*self.starts), **COMMON}
         if self.maps:
             options["map"] = MAP
         if self.body == "ant":
@@ -146,41 +145,11 @@ class Task:
         return options | {key: replace(options[key], default=value) for key, value in self.defaults.items()}
 
 
-MAP = Option(None, lambda value: isinstance(value, str) and bool(value), "the path of a map, or its rows")
-
-COMMON: Mapping[str, Option] = {
-    "episode_length": count(500, 100_000),
-    "observe": choice("published", "full"),
-    "reward": choice("distance", "sparse"),
-    "success_radius": number(None, 0.01, 100.0, "m"),
-    "cell": number(None, *CELL_SIZES, "m"),
-    "action_scale": number(1.0, 0.01, 10.0),
-    "position_noise": number(0.0, 0.0, 1.0, "m"),
-    "flip": choice(*ENDS),
-    "fall": choice(*ENDS),
-    "unhealthy": choice(*ENDS),
-}
-
-ANT: Mapping[str, Option] = {
-    "observe": choice("published", "full", "untimed"),
-    "model": choice("published", "jaxgcrl"),
-    "collisions": choice("all", "feet"),
-    "margin": number(0.01, 0.0, 0.1, "m"),
-    "timestep": duration(0.02, 1.0),
-    "frames": count(5, 1000),
-    "solver": choice(*SOLVERS),
-    "cone": choice(*CONES),
-    "integrator": replace(choice(*INTEGRATORS), default=None),  # None: that of the preset
-    "iterations": count(None, 10_000),
-    "ls_iterations": count(None, 10_000),
-}
-
-
 def plane(arena: Arena) -> Geometry:
     """Goals and regions over x and y: the box around the free cells, cut in the middle of both."""
     free = arena.free()
     (x_lo, y_lo), (x_hi, y_hi) = free[:, :2].min(0).tolist(), free[:, 2:].max(0).tolist()
-    reach = max(1.25 * arena.cell, 5.0)
+    reach = max(1.25 * arena.cell, min(2.5 * arena.cell, 5.0))
     return Geometry(
         goal_indices=(0, 1),
         abstract_indices=(0, 1),
@@ -286,6 +255,12 @@ FALL_GEOMETRY = Geometry(
 )
 
 
+# In OGBench and Gymnasium-Robotics all geoms have a margin of .01 m, and MuJoCo adds those of two that meet.
+BOTH_MARGINS = {"margin": 0.02, "wall_margin": 0.02}
+GYMNASIUM_DT = 0.01  # s
+POINT_MASS = 1000 * 4 / 3 * np.pi * 0.1**3  # kg, of a ball of .1 m as dense as water
+
+
 def _jaxgcrl(body: str, arena: Arena, train: Places, test: Places, start: Places | None = None) -> Task:
     goals, presets = {"train": train, "test": test}, ("fast", "published", "jaxgcrl")
     return maze(
@@ -298,6 +273,58 @@ def _jaxgcrl_maze(body: str, arena: Arena, test: Arena) -> Task:
 
 
 AROUND, NEAR = circle(10.0, parts=180), box((-0.1, -0.1), (0.1, 0.1))  # of JaxGCRL's `ant`, which has no maze
+
+
+def _ogbench(body: str, name: str) -> Task:
+    """A maze of OGBench: starts and goals lie within a quarter of a cell of the middle, along x and along y."""
+    arena, cells = layouts.OGBENCH[name]
+    noise, radius = arena.cell / 4, {"ant": 0.5, "point": 1.0}[body]
+    every, defaults = (
+        pairs(arena, cells, noise=noise),
+        {"episode_length": 1000, "reward": "sparse", "at_goal": "terminate"},
+    )
+    if body == "ant":
+        defaults |= {"observe": "untimed", **BOTH_MARGINS}
+    return maze(
+        body,
+        arena,
+        goals={},
+        pairs=dict.fromkeys(("train", "test", "tasks"), every)
+        | {f"task{n}": pairs(arena, [one], noise=noise) for n, one in enumerate(cells, start=1)},
+        start=around(arena, ROBOT, clearance=arena.cell / 2 - noise),
+        success_radius=radius,
+        clearance={"ant": CLEARANCE["ant"], "point": 0.8}[body],
+        place_noise=0.0,
+        motion=Motion(radius=0.7, speed=2.0, response=1.0),
+        defaults=defaults,
+    )
+
+
+def _gymnasium(body: str, name: str, *, cell: float, wall_height: float, episode_length: int) -> Task:
+    """A maze of Gymnasium-Robotics: start and goal are in different cells, within a quarter of one of their middles.
+
+    The point of 4.19 kg is pushed by up to 100 N against a drag of 1 N s/m, which MuJoCo's Euler steps take implicitly.
+    """
+    arena = Arena(layouts.GYMNASIUM[name], cell, wall_height=wall_height)
+    noise, drag = cell / 4, GYMNASIUM_DT / (POINT_MASS + GYMNASIUM_DT)
+    every = pairs(arena, itertools.permutations(arena.cells(FREE + ROBOT), 2), noise=noise)
+    defaults: dict[str, Any] = {"episode_length": episode_length, "reward": "sparse"}
+    if body == "ant":
+        ant = {"observe": "untimed", "model": "gymnasium", "timestep": GYMNASIUM_DT, "action_scale": 5.0}
+        defaults |= ant | BOTH_MARGINS
+    return maze(
+        body,
+        arena,
+        goals={},
+        pairs={"train": every, "test": every},
+        start=around(arena, FREE + ROBOT, clearance=cell / 2 - noise),
+        success_radius=0.45,
+        clearance={"ant": CLEARANCE["ant"], "point": 0.15}[body],
+        place_noise=0.0,
+        pose_noise=0.0,
+        motion=Motion(radius=0.1, speed=100.0, response=drag, dt=GYMNASIUM_DT, limit=5.0),
+        defaults=defaults,
+    )
 
 
 def _both(body: str) -> dict[str, Task]:
@@ -317,6 +344,7 @@ def _both(body: str) -> dict[str, Task]:
         f"{body}_u5_maze": _jaxgcrl_maze(body, layouts.U5_MAZE, layouts.U5_MAZE_TEST),
         f"{body}_big_maze": _jaxgcrl_maze(body, layouts.BIG_MAZE, layouts.BIG_MAZE_TEST),
         f"{body}_hardest_maze": _jaxgcrl_maze(body, layouts.HARDEST_MAZE, layouts.HARDEST_MAZE),
+        **{f"{body}maze-{name}": _ogbench(body, name) for name in layouts.OGBENCH},
     }
 
 
@@ -332,6 +360,14 @@ TASKS: Mapping[str, Task] = {
         goals={"train": box((-12.0, -4.0), (12.0, 20.0)), "test": point(0.0, 16.0)},
         block_noise=1.0,
     ),
+    **{
+        f"PointMaze_{name}": _gymnasium("point", name, cell=1.0, wall_height=0.4, episode_length=length)
+        for name, length in (("UMaze", 300), ("Medium", 600), ("Large", 800))
+    },
+    **{
+        f"AntMaze_{name}": _gymnasium("ant", name, cell=4.0, wall_height=2.0, episode_length=length)
+        for name, length in (("UMaze", 700), ("Medium", 1000), ("Large", 1000))
+    },
 }
 
 

@@ -12,4 +12,4 @@ jitted = cache(jax.jit)
 @cache
 def made(name, **options):
     """What `envs.make` makes; an ant is simulated by MuJoCo in C unless `options` say otherwise."""
-    return envs.make(name, **({"engine": "native"} if name.startswith("ant") else {}) | options)
+    return envs.make(name, **({"engine": "native"} if name.lower().startswith("ant") else {}) | options)

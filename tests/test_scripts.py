@@ -52,7 +52,7 @@ def test_the_check_of_the_physics_passes_and_notices_another_model(monkeypatch):
     batch.model.opt.gravity[2] *= 0.9
     assert script.one_step(batch)["one_step"] > 1e-3
     monkeypatch.setattr(Arena, "walls", Arena.free)
-    assert script.throws(batch, 20) == 20  # everywhere is now a wall
+    assert script.throws(batch, 20) == {"crossings": 20, "over": 0}  # everywhere is now a wall
 
 
 def test_the_check_against_jaxgcrl_gives_each_motor_its_own_action_and_counts_contacts():

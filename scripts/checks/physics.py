@@ -10,6 +10,7 @@ For each task, from random starts and under uniform random actions:
                 two-sample Kolmogorov-Smirnov tests between engine and MuJoCo over `--rollouts` episodes, of the
                 means over an episode of height and speed, and of the distance travelled
     crossings   throws of an ant at 3 to 12 m/s, from anywhere in any direction, that ended in a wall or the floor
+    over        throws that bounced higher than the walls, which are not followed any further
     rest        lowest torso above its floor, in m, after 2 s without action, and contacts MuJoCo counts there
     non_finite, overflow
                 env steps of `--random-steps` after which the environment had to be reset
@@ -35,8 +36,9 @@ import numpy as np
 from scipy import stats
 
 import envs
-from envs.ant import MAX_TORQUE, QPOS
-from envs.arena import HEIGHT, Arena
+from envs.ant import QPOS
+from envs.arena import Arena
+from envs.tasks import TASKS
 
 TOLERANCE = {"native": 1e-5, "jax": 1e-3, "warp": 1e-3}
 P_VALUE = 1e-3
@@ -89,13 +91,20 @@ def one_step(batch: Batch) -> dict[str, Any]:
     frames = round(batch.env.dt / batch.model.opt.timestep)
     gaps = [
         np.abs(
-            mujoco_path(batch.model, start.qpos[i], start.qvel[i], MAX_TORQUE * action[None, i], frames)[0, :-2]
+            mujoco_path(batch.model, start.qpos[i], start.qvel[i], torque(batch.model) * action[None, i], frames)[
+                0, :-2
+            ]
             - after[i]
         )
         for i in range(n)
     ]
     worst = np.max(gaps, axis=0)
     return {"one_step": float(worst.max()), "one_step_at": int(worst.argmax())}
+
+
+def torque(model: mujoco.MjModel) -> float:
+    """The torque of an action of 1, in N m."""
+    return float(model.actuator_ctrlrange[0, 1])
 
 
 def summaries(path: np.ndarray) -> np.ndarray:
@@ -117,7 +126,9 @@ def distributions(batch: Batch, rollouts: int, steps: int) -> dict[str, float]:
     frames = round(batch.env.dt / batch.model.opt.timestep)
 
     def plain(i: int) -> np.ndarray:
-        return summaries(mujoco_path(batch.model, start.qpos[i], start.qvel[i], MAX_TORQUE * actions[:, i], frames))
+        return summaries(
+            mujoco_path(batch.model, start.qpos[i], start.qvel[i], torque(batch.model) * actions[:, i], frames)
+        )
 
     with ThreadPoolExecutor() as pool:
         reference = np.array(list(pool.map(plain, range(n))))
@@ -152,13 +163,21 @@ def barred(batch: Batch, state: Any, n: int) -> np.ndarray:
 
 def top_of(arena: Arena) -> float:
     """Height of the walls' upper edges."""
-    return arena.floor_height + HEIGHT
+    return arena.floor_height + arena.wall_height
 
 
-def throws(batch: Batch, number: int) -> int:
-    """Ants among `number` thrown that end in a wall."""
+def above(batch: Batch, state: Any, n: int) -> np.ndarray:
+    """True if each of the first n torsos is higher than the walls."""
+    return np.asarray(state.pipeline_state.data.qpos[:n, 2]) > top_of(batch.env.arena)
+
+
+def throws(batch: Batch, number: int) -> dict[str, int]:
+    """Ants among `number` thrown: `crossings` are found in a wall or behind it, `over` have been higher than the walls.
+
+    Of those that have, what follows is not looked at.
+    """
     rng = np.random.default_rng(2)
-    arena, crossed = batch.env.arena, 0
+    arena, crossed, over = batch.env.arena, 0, 0
     for begin in range(0, number, batch.size):
         n = min(batch.size, number - begin)
         centres = arena.centres("0rg")[rng.integers(len(arena.centres("0rg")), size=n)]
@@ -171,12 +190,13 @@ def throws(batch: Batch, number: int) -> int:
         qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
         qvel[:, 0], qvel[:, 1] = speed * np.cos(angle), speed * np.sin(angle)
         state = batch.put(batch.reset(jax.random.key(3)), qpos.astype(np.float32), qvel.astype(np.float32))
-        found = np.zeros(n, bool)
+        found, high = np.zeros(n, bool), np.zeros(n, bool)
         for _ in range(THROW_STEPS):
             state = batch.step(state, jnp.zeros((batch.size, 8)))
-            found |= barred(batch, state, n)
-        crossed += int(found.sum())
-    return crossed
+            high |= above(batch, state, n)
+            found |= barred(batch, state, n) & ~high
+        crossed, over = crossed + int(found.sum()), over + int(high.sum())
+    return {"crossings": crossed, "over": over}
 
 
 def rest(batch: Batch) -> dict[str, float]:
@@ -216,7 +236,7 @@ def verify(task: str, options: argparse.Namespace) -> dict[str, Any]:
     row: dict[str, Any] = {"task": task, "engine": batch.env.engine, "preset": options.preset, "reference": reference}
     row |= one_step(batch) | rest(batch)
     row |= distributions(batch, options.rollouts, options.steps)
-    row |= {"throws": options.throws, "crossings": throws(batch, options.throws)}
+    row |= {"throws": options.throws} | throws(batch, options.throws)
     if options.random_steps:
         row |= random_steps(batch, options.random_steps)
     sound = row["crossings"] == 0 and row["rest"] > 0.1 and row["contacts"] > 0
@@ -228,7 +248,7 @@ def verify(task: str, options: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("tasks", nargs="*", default=[name for name in envs.names() if name.startswith("ant_")])
+    parser.add_argument("tasks", nargs="*", default=[name for name in envs.names() if TASKS[name].body == "ant"])
     parser.add_argument("--engine", default="auto")
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--reference", help="preset of the model that MuJoCo steps (default: the same)")

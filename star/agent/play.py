@@ -193,7 +193,7 @@ def rollout(
             "action": action,
             "success": after.metrics["success"],
             "distance": after.metrics["distance"],
-            "terminated": after.done * (1 - after.info["truncation"]),
+            "terminated": _lost(after),
             "ended": after.done * (after.info["steps"] < length),
             "alive": alive,
             "non_finite": after.metrics["non_finite"],
@@ -213,6 +213,12 @@ def rollout(
     path: dict[str, Array] = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, ends)
     passed = Segment(**path, **steps, box=box, choice=choice)
     return streams.replace(env=env_state, episode=episode), passed
+
+
+def _lost(after: EnvState) -> Array:
+    """1 where the task ended the episode, but not where success alone did: that is bootstrapped like a time limit."""
+    mishap = jnp.stack([after.metrics[name] for name in MISHAPS]).max(axis=0)
+    return after.done * (1 - after.info["truncation"]) * jnp.maximum(mishap, 1 - after.metrics["success"])
 
 
 def restart_ended(agent: Agent, env: VectorEnv, streams: Streams, passed: Segment, *, key: Array) -> Streams:

@@ -263,6 +263,8 @@ def test_an_error_while_recording_becomes_one_of_the_configuration(tmp_path):
 def test_the_gallery_shows_every_task_and_is_small():
     page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     images = ROOT / "docs" / "images"
-    for name in envs.names():
+    for name in load("pages/gallery").by_maze(envs.names()):
         assert f"](images/{name}.jpg)" in page and (images / f"{name}.jpg").is_file(), "run scripts/pages/gallery.py"
+    for name in envs.names():
+        assert f"`{name}`" in page
     assert sum(path.stat().st_size for path in images.iterdir()) < 2e6

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import envs
+from envs._quiet import State
 from star.abstraction import regions
 from star.agent import commander, levels, play
 from star.agent.decisions import Roadmap, Scene, target_box
@@ -200,6 +201,14 @@ def test_episode_statistics_are_those_of_the_steps_since_the_last_reset(recordin
         if ended(recording, i, b):
             any_[b] = total[b] = there[b] = 0
     np.testing.assert_allclose(recording.last.episode.total, total, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("flipped", "success", "lost"), [(0, 0, 1), (1, 0, 1), (0, 1, 0), (1, 1, 1)])
+def test_an_end_for_success_alone_is_no_loss(flipped, success, lost):
+    mishaps = {"flipped": flipped, "fallen": 0, "unhealthy": 0}
+    metrics = {name: jnp.ones(2) * value for name, value in {**mishaps, "success": success}.items()}
+    after = State(None, None, None, done=jnp.array([1.0, 0.0]), metrics=metrics, info={"truncation": jnp.zeros(2)})
+    np.testing.assert_array_equal(play._lost(after), [lost, 0])
 
 
 def test_dimensions_that_the_goal_leaves_open_keep_the_bounds_of_the_region(tiny):

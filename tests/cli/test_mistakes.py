@@ -43,6 +43,7 @@ FILES = {
     "unused.csv": "exercise,skill\nsums,add\ntables,multiply\nunions,sets\n",
     "twice.csv": "exercise,skill\nsums,add\nsums,add\n",
     "oneskill.csv": "exercise,skill\nsums,add\ntables,add\n",
+    "large.txt": "1" * 65 + "\n1r" + "0" * 62 + "1\n" + "1" * 65 + "\n",
     "taken/graph.json": "precious",
     "runs/bad/config.yaml": "tutor: [",
     "runs/alien/config.yaml": "experiment: their:KIND\n",

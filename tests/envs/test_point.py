@@ -8,11 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import envs
-from envs.point import MAX_SPEED, RADIUS, Point, PointState
+from envs.point import Point, PointState
 from envs.tasks import TASKS
 
 WALLS = TASKS["point_maze"].arena.walls()
 POINT = Point(TASKS["point_maze"])
+RADIUS, MAX_SPEED = TASKS["point_maze"].motion.radius, TASKS["point_maze"].motion.speed
 STEPS = 50
 
 

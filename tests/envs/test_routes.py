@@ -86,7 +86,9 @@ def test_ways_are_as_short_as_any_and_turn_as_little(arena):
         assert length == pytest.approx(steps * arena.cell) and len(way) == turns and way[-1] == arena.centre(end)
 
 
-@pytest.mark.parametrize("name", {(task.arena, task.switch): name for name, task in TASKS.items()}.values())
+@pytest.mark.parametrize(
+    "name", {(task.arena, task.switch): name for name, task in TASKS.items() if not task.pairs}.values()
+)
 def test_no_way_of_any_task_cuts_through_a_wall_or_falls(name):
     arena, switch = TASKS[name].arena, TASKS[name].switch
     ways = all_routes(arena, switch)
