@@ -24,6 +24,7 @@ from star.agent import exams, films
 from star.agent.exams import Exam, Target
 from star.agent.films import Moments, Show
 from star.config.loading import load, parse
+from tests.scripts import load as load_script
 
 ROOT = Path(__file__).parents[2]
 EPISODE = 40
@@ -263,7 +264,7 @@ def test_an_error_while_recording_becomes_one_of_the_configuration(tmp_path):
 def test_the_gallery_shows_every_task_and_is_small():
     page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     images = ROOT / "docs" / "images"
-    for name in load("pages/gallery").by_maze(envs.names()):
+    for name in load_script("pages/gallery").by_maze(envs.names()):
         assert f"](images/{name}.jpg)" in page and (images / f"{name}.jpg").is_file(), "run scripts/pages/gallery.py"
     for name in envs.names():
         assert f"`{name}`" in page
