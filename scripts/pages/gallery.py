@@ -25,7 +25,7 @@ from star.training.figures import save
 
 DOCS = Path(__file__).parents[2] / "docs"
 HEADING = "## Tasks\n"
-SHARED = "Where a point walks in the same maze, the picture shows the ant.\n"
+SHARED = "A point and an ant in the same maze share a picture, of the ant.\n"
 HEIGHT, SMALL = 340, 200  # pixels; small are the mazes of other projects, of which many are alike
 
 

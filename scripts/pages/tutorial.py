@@ -49,7 +49,7 @@ def told(text: str, folder: Path) -> tuple[str, list[tuple[str, float]]]:
 
 
 def run(commands: str, folder: Path) -> str:
-    """What the commands print, in `folder` with its virtual environment; SystemExit if one fails."""
+    """All that the commands print, in `folder` with its virtual environment; SystemExit if one fails."""
     script = f"set -e; [ ! -d .venv ] || . .venv/bin/activate\n{commands}"
     done = subprocess.run(
         ["bash", "-c", script], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
