@@ -61,7 +61,8 @@ def run(commands: str, folder: Path) -> str:
 
 def shown(printed: str) -> str:
     """Its last lines, without trailing blanks and lines that are empty."""
-    lines = [line.rstrip()[:WIDEST] for line in printed.splitlines() if line.strip()]
+    whole = [line.rstrip() for line in printed.splitlines() if line.strip()]
+    lines = [line if len(line) <= WIDEST else f"{line[: WIDEST - 1].rstrip()}…" for line in whole]
     return "".join(f"{line}\n" for line in ["..."] * (len(lines) > MOST) + lines[-MOST:])
 
 
