@@ -179,8 +179,8 @@ MENDS = (
         "a room that nobody reaches holds goals and starts",
         "tests/envs/test_maps.py::test_cells_that_nobody_reaches_are_told_of_and_hold_neither_goals_nor_starts",
         "envs/arena.py",
-        "return walled(arena, sealed)",
-        "return arena",
+        "written = walled(arena, sealed)",
+        "written = arena",
     ),
     Mend(
         "a room that nobody reaches is told of by no command",
