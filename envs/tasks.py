@@ -279,10 +279,8 @@ def _ogbench(body: str, name: str) -> Task:
     """A maze of OGBench: starts and goals lie within a quarter of a cell of the middle, along x and along y."""
     arena, cells = layouts.OGBENCH[name]
     noise, radius = arena.cell / 4, {"ant": 0.5, "point": 1.0}[body]
-    every, defaults = (
-        pairs(arena, cells, noise=noise),
-        {"episode_length": 1000, "reward": "sparse", "at_goal": "terminate"},
-    )
+    every = pairs(arena, cells, noise=noise)
+    defaults: dict[str, Any] = {"episode_length": 1000, "reward": "sparse", "at_goal": "terminate"}
     if body == "ant":
         defaults |= {"observe": "untimed", **BOTH_MARGINS}
     return maze(

@@ -56,7 +56,7 @@ def test_the_check_of_the_physics_passes_and_notices_another_model(monkeypatch):
 
 
 def test_the_check_against_jaxgcrl_gives_each_motor_its_own_action_and_counts_contacts():
-    script, env = load("checks/jaxgcrl"), envs.make("ant_open", preset="jaxgcrl", engine="native")
+    script, env = load("checks/against_jaxgcrl"), envs.make("ant_open", preset="jaxgcrl", engine="native")
     model, rng = env.body.physics.model, np.random.default_rng(0)
     assert [model.actuator(i).name for i in script.MOTORS[:3]] == ["hip_4", "ankle_4", "hip_1"]  # its first motors
     action, data = rng.uniform(-1, 1, (2, 8)).astype(np.float32), mujoco.MjData(model)

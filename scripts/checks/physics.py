@@ -10,7 +10,7 @@ For each task, from random starts and under uniform random actions:
                 two-sample Kolmogorov-Smirnov tests between engine and MuJoCo over `--rollouts` episodes, of the
                 means over an episode of height and speed, and of the distance travelled
     crossings   throws of an ant at 3 to 12 m/s, from anywhere in any direction, that ended in a wall or the floor
-    over        throws that bounced higher than the walls, which are not followed any further
+    over        where walls are lower than 4 m, throws that bounced over them, which are not followed any further
     rest        lowest torso above its floor, in m, after 2 s without action, and contacts MuJoCo counts there
     non_finite, overflow
                 env steps of `--random-steps` after which the environment had to be reset
@@ -37,7 +37,7 @@ from scipy import stats
 
 import envs
 from envs.ant import QPOS
-from envs.arena import Arena
+from envs.arena import HEIGHT, Arena
 from envs.tasks import TASKS
 
 TOLERANCE = {"native": 1e-5, "jax": 1e-3, "warp": 1e-3}
@@ -167,12 +167,13 @@ def top_of(arena: Arena) -> float:
 
 
 def above(batch: Batch, state: Any, n: int) -> np.ndarray:
-    """True if each of the first n torsos is higher than the walls."""
-    return np.asarray(state.pipeline_state.data.qpos[:n, 2]) > top_of(batch.env.arena)
+    """True if each of the first n torsos is higher than the walls, if these are lower than usual."""
+    arena = batch.env.arena
+    return np.asarray(state.pipeline_state.data.qpos[:n, 2] > top_of(arena)) & (arena.wall_height < HEIGHT)
 
 
 def throws(batch: Batch, number: int) -> dict[str, int]:
-    """Ants among `number` thrown: `crossings` are found in a wall or behind it, `over` have been higher than the walls.
+    """Ants among `number` thrown: `crossings` are found in a wall or behind it, `over` have been `above` the walls.
 
     Of those that have, what follows is not looked at.
     """

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 import envs
 from envs import layouts
 from envs.tasks import TASKS
+from scripts.pages import charts
 from star import cli
 from star.agent.figures import draw_walls, frame
-from star.training.figures import save
 
 DOCS = Path(__file__).parents[2] / "docs"
 HEADING = "## Tasks\n"
@@ -29,7 +29,7 @@ SHARED = "A point and an ant in the same maze share a picture, of the ant.\n"
 HEIGHT, SMALL = 340, 200  # pixels; small are the mazes of other projects, of which many are alike
 
 
-def draw_tasks(path: Path) -> None:
+def draw_tasks() -> Figure:
     """An arrow for each of the five tasks of OGBench's mazes, from its number at the start to its goal."""
     figure = Figure(figsize=(8.0, 2.6), layout="constrained")
     shown = [name for name, (_, cells) in layouts.OGBENCH.items() if len(cells) > 1]
@@ -45,7 +45,7 @@ def draw_tasks(path: Path) -> None:
             axis.text(begin[0] + 1.6 * turn, begin[1], str(number), color=f"C{number - 1}", ha="center", va="center")
         frame(axis, walls[:, :2], walls[:, 2:])
         axis.set_title(name)
-    save(figure, path)
+    return figure
 
 
 def by_maze(names: Sequence[str]) -> dict[str, list[str]]:
@@ -64,11 +64,11 @@ def main() -> int:
     mazes = by_maze(envs.names())
     for name in parser.parse_args().tasks or mazes:
         height = str(SMALL if TASKS[name].pairs else HEIGHT)
-        out = str(DOCS / "images" / f"{name}.jpg")
+        out = str(charts.IMAGES / f"{name}.jpg")
         code = cli.main(["render", name, "--out", out, "--height", height, "--force"])
         if code:
             return code
-    draw_tasks(DOCS / "images" / "ogbench_tasks.png")
+    charts.save(draw_tasks(), "ogbench_tasks", dpi=160)
     page = DOCS / "gallery.md"
     before, _, _ = page.read_text(encoding="utf-8").partition(HEADING)
     pictures = [

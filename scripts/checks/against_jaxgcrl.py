@@ -1,7 +1,7 @@
 """Compare preset `jaxgcrl` with JaxGCRL's own environments on its backend `mjx`, and write a JSON file.
 
     git clone https://github.com/MichalBortkiewicz/JaxGCRL
-    python scripts/checks/jaxgcrl.py JaxGCRL --engines jax native --out results/physics/jaxgcrl.json
+    python scripts/checks/against_jaxgcrl.py JaxGCRL --engines jax native --out results/physics/jaxgcrl.json
 
     goals, test_goals   True if they are the same; of its `ant`, whose goals are a circle, the radii of both
     p_start             two-sample Kolmogorov-Smirnov tests of the starts: the smallest p-value of 29 numbers
