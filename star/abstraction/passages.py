@@ -21,6 +21,9 @@ goals are: in the middle of the wall.
 
 from __future__ import annotations
 
+from functools import partial
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -36,8 +39,17 @@ TRIES = 10  # periods towards goals on the other side
 PASSED = 0.1  # the most of them that end there: regions are large, and a period may end before a plane that is far
 ABLE = 0.5  # the least of the goals on their own side that agents reach: who cannot walk yet reaches none
 
-Parts = Int[Array, "N d"]
 Planes = Float[Array, "R d planes"]
+
+
+class Ways(NamedTuple):
+    """What N agents did, each told by K points."""
+
+    point: Float[Array, "K N d"]
+    region: Int[Array, "K N"]
+    part: Int[Array, "K N d"]
+    """Of the PLANES parts of the region of the first point, along each dimension, the one with each point."""
+    weight: Float[Array, "N"]
 
 
 def cuts(
@@ -57,37 +69,38 @@ def cuts(
     corner, sides = abstraction.lower, abstraction.upper - abstraction.lower
     inside = jnp.arange(1, PLANES) / PLANES * sides[..., None]
     wide = (inside >= min_width) & (sides[..., None] - inside >= min_width) & abstraction.active[:, None, None]
+    walked = _ways(abstraction, [periods.start, periods.end], periods.weight)
+    tried = _ways(abstraction, [goals.start, (goals.lower + goals.upper) / 2, goals.end], goals.weight)
+    moved = jnp.abs(periods.end - periods.start).max(axis=-1) >= min_width
     evidence = jnp.maximum(
-        _leading_apart(abstraction, periods, min_width=min_width), _not_passed(abstraction, goals, reached)
+        _leading_apart(abstraction, walked._replace(weight=walked.weight * moved)),
+        _not_passed(abstraction, tried, reached),
     )
-    room = _room(_free(abstraction, periods, goals))
+    room = _room(_free(abstraction, walked, tried))
     score = jnp.where(wide & (evidence > 0), evidence + room / PLANES, 0.0)
     return _best(score, corner[..., None] + inside), jnp.floor(score.max(axis=(1, 2)))
 
 
-def _leading_apart(abstraction: Abstraction, periods: Outcome, *, min_width: float | Array) -> Planes:
+def _leading_apart(abstraction: Abstraction, walked: Ways) -> Planes:
     """The periods on the emptier side of each plane whose sides lead to different places; 0 at all others."""
-    region, there = (regions.locate(abstraction, point) for point in (periods.start, periods.end))
-    moved = jnp.abs(periods.end - periods.start).max(axis=-1) >= min_width
-    counted, stays = periods.weight * moved, region == there
-    began, ended = (_part(abstraction, region, point) for point in (periods.start, periods.end))
+    region, there = walked.region
+    began, ended = walked.part
+    stays = region == there
     capacity, d = abstraction.lower.shape
     led = jnp.zeros((capacity, d, PLANES, capacity))
-    led = led.at[region[:, None], jnp.arange(d), began, there[:, None]].add((counted * ~stays)[:, None])
+    led = led.at[region[:, None], jnp.arange(d), began, there[:, None]].add((walked.weight * ~stays)[:, None])
     out_below = jnp.cumsum(led, axis=2)[:, :, :-1]
     out_above = led.sum(axis=2, keepdims=True) - out_below
 
-    staying = counted * stays
-    below = lambda parts: _below(abstraction, region, parts, staying)  # noqa: E731
-    total = jnp.zeros(capacity).at[region].add(staying)[:, None, None]
-    from_below, to_below = below(began), below(ended)
-    both_below = below(jnp.maximum(began, ended))
-    both_above = total - below(jnp.minimum(began, ended))
+    parts = jnp.stack([began, ended, jnp.maximum(began, ended), jnp.minimum(began, ended)])
+    below, total = _below(abstraction, region, parts, jnp.broadcast_to(walked.weight * stays, parts.shape[:2]))
+    from_below, to_below, both_below, either_below = below
+    both_above = total[0] - either_below
     up, down = from_below - both_below, to_below - both_below
 
     number_below, number_above = (
         jnp.maximum(one, 1e-6)
-        for one in (out_below.sum(axis=-1) + from_below, out_above.sum(axis=-1) + total - from_below)
+        for one in (out_below.sum(axis=-1) + from_below, out_above.sum(axis=-1) + total[0] - from_below)
     )
     common = lambda low, high: jnp.minimum(low / number_below, high / number_above)  # noqa: E731
     overlap = jnp.minimum(out_below / number_below[..., None], out_above / number_above[..., None]).sum(axis=-1)
@@ -96,27 +109,31 @@ def _leading_apart(abstraction: Abstraction, periods: Outcome, *, min_width: flo
     return jnp.where((fewer >= LEAST) & (overlap <= OVERLAP), fewer, 0.0)
 
 
-def _not_passed(abstraction: Abstraction, goals: Outcome, reached: Bool[Array, "M"]) -> Planes:
+def _not_passed(abstraction: Abstraction, tried: Ways, reached: Bool[Array, "M"]) -> Planes:
     """The periods towards goals beyond each plane that agents do not pass; 0 at all others."""
-    goal = (goals.lower + goals.upper) / 2
-    region, goal_region, there = (regions.locate(abstraction, point) for point in (goals.start, goal, goals.end))
-    began, wanted, ended = (_part(abstraction, region, point) for point in (goals.start, goal, goals.end))
-    weight = goals.weight * (region == goal_region)
+    region, goal_region, there = tried.region
+    began, wanted, ended = tried.part
+    weight = tried.weight * (region == goal_region)
     low, high = jnp.minimum(began, wanted), jnp.maximum(began, wanted)
     got = jnp.clip(jnp.where((there == region)[:, None], ended, began), low, high)  # so far on the way to the goal
-    below = lambda parts, weight: _below(abstraction, region, parts, weight)  # noqa: E731
-    tried = below(low, weight) - below(high, weight)
-    passed = below(jnp.minimum(began, got), weight) - below(jnp.maximum(began, got), weight)
-
-    def on_own_side(weight: Float[Array, "M"]) -> Planes:
-        total = jnp.zeros(len(abstraction.lower)).at[region].add(weight)[:, None, None]
-        return below(high, weight) + total - below(low, weight)
-
-    able = on_own_side(weight * reached) >= ABLE * jnp.maximum(on_own_side(weight), TRIES)
-    return jnp.where((tried >= TRIES) & (passed <= PASSED * tried) & able, tried, 0.0)
+    parts = jnp.stack([low, high, jnp.minimum(began, got), jnp.maximum(began, got), low, high])
+    below, total = _below(abstraction, region, parts, jnp.stack([weight] * 4 + [weight * reached] * 2))
+    attempts, passed = below[0] - below[1], below[2] - below[3]
+    on_own_side, met = below[1] + total[1] - below[0], below[5] + total[5] - below[4]
+    able = met >= ABLE * jnp.maximum(on_own_side, TRIES)
+    return jnp.where((attempts >= TRIES) & (passed <= PASSED * attempts) & able, attempts, 0.0)
 
 
-def _part(abstraction: Abstraction, region: Int[Array, "N"], point: Float[Array, "N d"]) -> Parts:
+def _ways(abstraction: Abstraction, points: list[Float[Array, "N d"]], weight: Float[Array, "N"]) -> Ways:
+    """Find the points in the table of regions."""
+    point = jnp.stack(points)
+    region = regions.locate(abstraction, point)
+    return Ways(point, region, _part(abstraction, region[0], point), weight)
+
+
+def _part(
+    abstraction: Abstraction, region: Int[Array, "*N"], point: Float[Array, "*batch d"]
+) -> Int[Array, "*batch d"]:
     """In which of the PLANES parts of its `region` each point is, along each dimension."""
     lower, upper = abstraction.lower[region], abstraction.upper[region]
     share = (point - lower) / (upper - lower)
@@ -124,16 +141,20 @@ def _part(abstraction: Abstraction, region: Int[Array, "N"], point: Float[Array,
 
 
 def _count(
-    abstraction: Abstraction, region: Int[Array, "N"], parts: Parts, weight: Float[Array, "N"]
+    abstraction: Abstraction, region: Int[Array, "N"], part: Int[Array, "N d"], weight: Float[Array, "N"]
 ) -> Float[Array, "R d parts"]:
     """Count in each part."""
     capacity, d = abstraction.lower.shape
-    return jnp.zeros((capacity, d, PLANES)).at[region[:, None], jnp.arange(d), parts].add(weight[:, None])
+    return jnp.zeros((capacity, d, PLANES)).at[region[:, None], jnp.arange(d), part].add(weight[:, None])
 
 
-def _below(abstraction: Abstraction, region: Int[Array, "N"], parts: Parts, weight: Float[Array, "N"]) -> Planes:
-    """Count in the parts below each plane."""
-    return jnp.cumsum(_count(abstraction, region, parts, weight), axis=-1)[..., :-1]
+def _below(
+    abstraction: Abstraction, region: Int[Array, "N"], part: Int[Array, "K N d"], weight: Float[Array, "K N"]
+) -> tuple[Float[Array, "K R d planes"], Float[Array, "K R d 1"]]:
+    """Counts in the parts below each plane, and in all."""
+    count = jax.vmap(partial(_count, abstraction, region))(part, weight)
+    upto = jnp.cumsum(count, axis=-1)
+    return upto[..., :-1], upto[..., -1:]
 
 
 def _best(score: Planes, position: Planes) -> Cut:
@@ -143,16 +164,12 @@ def _best(score: Planes, position: Planes) -> Cut:
     return Cut(region=each, dimension=along, position=position[each, along, plane])
 
 
-def _free(abstraction: Abstraction, periods: Outcome, goals: Outcome) -> Bool[Array, "R d parts"]:
+def _free(abstraction: Abstraction, walked: Ways, tried: Ways) -> Bool[Array, "R d parts"]:
     """The parts of each region that are free somewhere: periods began or ended there, or a goal lies there."""
-
-    def count(points: Float[Array, "N d"], weight: Float[Array, "N"]) -> Float[Array, "R d parts"]:
-        region = regions.locate(abstraction, points)
-        return _count(abstraction, region, _part(abstraction, region, points), weight)
-
-    goal = (goals.lower + goals.upper) / 2
-    visited = count(periods.start, periods.weight) + count(periods.end, periods.weight)
-    return visited + count(goal, goals.weight) > 0
+    point = jnp.concatenate([*walked.point, tried.point[1]])
+    region = jnp.concatenate([*walked.region, tried.region[1]])
+    weight = jnp.concatenate([walked.weight, walked.weight, tried.weight])
+    return _count(abstraction, region, _part(abstraction, region, point), weight) > 0
 
 
 def _room(free: Bool[Array, "R d parts"]) -> Int[Array, "R d planes"]:

@@ -201,13 +201,16 @@ def refine(
     (abstraction, graph), (splits, found, mixed) = jax.lax.scan(
         one_pair, (abstraction, graph), jax.random.split(key, config.refinement.pairs_per_epoch)
     )
-    abstraction, graph, more = _separate(config, abstraction, graph, periods, goals, met)
-    splits = jax.tree.map(lambda x, other: jnp.concatenate([x.reshape(-1), other]), splits, more)
+    splits, separated = jax.tree.map(jnp.ravel, splits), jnp.zeros((), jnp.int32)
+    if config.refinement.separate:
+        abstraction, graph, more = _separate(config, abstraction, graph, periods, goals, met)
+        splits = jax.tree.map(lambda *both: jnp.concatenate(both), splits, more)
+        separated = more.done.sum()
     metrics = {
         "examined": found.sum(),
         "mixed": mixed.sum(),
         "splits": splits.done.sum(),
-        "separated": more.done.sum(),
+        "separated": separated,
         "edges": graph.reaches.sum(),
         "misses": graph.misses.sum(),
         "table_full": (abstraction.count == abstraction.capacity).astype(jnp.int32),
@@ -218,9 +221,9 @@ def refine(
 def _separate(
     config: Settings, abstraction: Abstraction, graph: Graph, periods: Outcome, goals: Outcome, met: Bool[Array, "N"]
 ) -> tuple[Abstraction, Graph, Split]:
-    """Cut regions where nobody passes, if that is wanted, those first in which most move on either side."""
+    """Cut regions where nobody passes, those first in which most move on either side."""
     cuts, evidence = passages.cuts(abstraction, periods, goals, met, min_width=config.abstraction.min_width)
-    worst = jnp.argsort(-evidence)[: _SEPARATED * config.refinement.separate]
+    worst = jnp.argsort(-evidence)[:_SEPARATED]
 
     def one(carry: tuple[Abstraction, Graph], chosen: tuple[Cut, Array]) -> tuple[tuple[Abstraction, Graph], Split]:
         cut, evidence = chosen
@@ -257,15 +260,16 @@ def on_split(graph: Graph, split: Split) -> Graph:
 
     All pairs with one of the parts must be commanded anew before they are examined.
     """
-    inherit = partial(regions.inherit, parent=split.parent, child=split.child, axes=(0, 1))
-    changed = jnp.zeros(graph.verdict.shape[0], bool).at[jnp.array([split.parent, split.child])].set(True)
-    parts = jax.tree.map(inherit, graph)
-    parts = parts.replace(
-        verdict=jnp.where(changed[None, :], UNKNOWN, parts.verdict),
-        transitions=jnp.where(changed[:, None] | changed[None, :], 0.0, parts.transitions),
-        told=jnp.where(changed[:, None] | changed[None, :], jnp.minimum(parts.told, 0), parts.told),
+    index = jnp.arange(graph.verdict.shape[0])
+    new = split.done & (index == split.child)
+    parts = jax.tree.map(partial(regions.inherit, origin=jnp.where(new, split.parent, index)), graph)
+    changed = new | (split.done & (index == split.parent))
+    pair = changed[:, None] | changed
+    return parts.replace(
+        verdict=jnp.where(changed, UNKNOWN, parts.verdict),
+        transitions=jnp.where(pair, 0.0, parts.transitions),
+        told=jnp.where(pair, jnp.minimum(parts.told, 0), parts.told),
     )
-    return where(split.done, parts, graph)
 
 
 def reached(goals: Outcome, cube: float | Array) -> Bool[Array, "N"]:

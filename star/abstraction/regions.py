@@ -207,9 +207,8 @@ def over_parts(table: Float[Array, "*R"], origin: Int[Array, "R"]) -> Float[Arra
     return jnp.zeros_like(table).at[cell].add(table)[cell]
 
 
-def inherit(table: Array, *, parent: Array, child: Array, axes: Sequence[int]) -> Array:
-    """Copy what `table` holds for region `parent` to region `child` along each of `axes` in turn."""
-    for axis in axes:
-        moved = jnp.moveaxis(table, axis, 0)
-        table = jnp.moveaxis(moved.at[child].set(moved[parent]), 0, axis)
+def inherit(table: Array, origin: Int[Array, "R"], *, axes: Sequence[int] | None = None) -> Array:
+    """What `table` holds, along its `axes` of regions (None: all), by regions of which j was cut from `origin` [j]."""
+    for axis in range(table.ndim) if axes is None else axes:
+        table = jnp.take(table, origin, axis=axis, mode="clip")
     return table

@@ -287,9 +287,8 @@ def follow(
     """
     origin = change.origin
     parts = regions.over_parts(jnp.ones(len(origin)), origin)
-    cube = jnp.ix_(origin, origin, origin)
     model = _rule(section).follow(section, state, change, known.model, finished, traffic)
-    return state.replace(q=state.q[cube], chosen=state.chosen[origin] / parts, model=model)
+    return state.replace(q=regions.inherit(state.q, origin), chosen=state.chosen[origin] / parts, model=model)
 
 
 def fade(section: CommanderConfig, state: CommanderState) -> CommanderState:

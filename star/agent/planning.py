@@ -150,7 +150,7 @@ def follow(
         target=jnp.where(decision.at_goal, goal_region, decision.target),
     )
     model = recounted(section, earlier, decision, cells, change.origin, traffic)
-    return model.replace(reach=_model(state).reach[jnp.ix_(*[change.origin] * 3)])
+    return model.replace(reach=regions.inherit(_model(state).reach, change.origin))
 
 
 def recounted(
@@ -257,16 +257,17 @@ def _inherited(
     most, as is what aiming at the goal pays in its own part. What goals elsewhere paid is forgotten: nobody knows in
     which part they were, and one success in fifteen, believed of the wrong part, holds agents before a wall.
     """
-    pair, cube = jnp.ix_(origin, origin), jnp.ix_(origin, origin, origin)
+    inherit = partial(regions.inherit, origin=origin)
     together = partial(regions.over_parts, origin=origin)
     cut = together(jnp.ones(len(origin))) > 1
     share = jnp.where(cut[:, None] | cut, traffic / jnp.maximum(together(traffic), 1.0), 1.0)
     began = traffic.sum(axis=1)
     of_part = jnp.where(cut, began / jnp.maximum(together(began), 1.0), 1.0)
-    led, lost = earlier.led[:, *cube] * share[:, None], earlier.lost[:, *pair] * of_part[:, None]
+    led = inherit(earlier.led, axes=(1, 2, 3)) * share[:, None]
+    lost = inherit(earlier.lost, axes=(1, 2)) * of_part[:, None]
     elsewhere = (cut[:, None] | cut) & ~jnp.eye(len(origin), dtype=bool)
     kept = jnp.where(elsewhere[..., None] | _beside(origin), 0.0, of_part[:, None, None])
-    rewards, visits = earlier.rewards[cube] * kept, earlier.visits[cube] * kept
+    rewards, visits = inherit(earlier.rewards) * kept, inherit(earlier.visits) * kept
 
     doubt = lambda number: section.prior / jnp.maximum(number, section.prior)  # noqa: E731
     of_commands = jnp.where(cut[:, None], doubt(led.sum(axis=-1) + lost), 1.0)

@@ -5,6 +5,8 @@ Source of its own cuts: SAGG-RIAC (Baranes and Oudeyer 2013).
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -29,7 +31,8 @@ def on_split(state: SgimState, abstraction: Abstraction, split: Split) -> SgimSt
     order, known = order[parent, ::-1], known[parent, ::-1]  # oldest first
     goals, competences = state.goals[parent, order], state.competences[parent, order]
     above = goals[:, cut.dimension] >= cut.position
-    inherit = lambda table: regions.inherit(table, parent=parent, child=child, axes=(0,))  # noqa: E731
+    origin = jnp.arange(abstraction.capacity).at[child].set(parent)
+    inherit = partial(regions.inherit, origin=origin, axes=(0,))
     parts = state.replace(
         abstraction=abstraction,
         mean=state.mean.at[jnp.array([parent, child])].set(jnp.inf),

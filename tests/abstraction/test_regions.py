@@ -172,5 +172,6 @@ def test_inherit_copies_along_each_axis():
     expected = table.copy()
     expected[2] = expected[1]
     expected[:, 2] = expected[:, 1]
-    got = regions.inherit(jnp.asarray(table), parent=jnp.int32(1), child=jnp.int32(2), axes=(0, 1))
-    np.testing.assert_array_equal(got, expected)
+    np.testing.assert_array_equal(regions.inherit(jnp.asarray(table), jnp.array([0, 1, 1])), expected)
+    expected = table[:, [0, 1, 1]]
+    np.testing.assert_array_equal(regions.inherit(jnp.asarray(table), jnp.array([0, 1, 1]), axes=(1,)), expected)
