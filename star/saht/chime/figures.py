@@ -40,7 +40,7 @@ def figures(room: Room, rows: Sequence[Row], tables: Sequence[Row]) -> dict[str,
 
 
 def kind(outcome: str, control: str) -> str:
-    """Which of `FIRSTS` a model with this outcome and control is."""
+    """The one of `FIRSTS` that a model with this outcome and control is."""
     return outcome if outcome == "robot" else "object" if control in ("action", "robot") else "object by object"
 
 
