@@ -166,9 +166,11 @@ def graph(axes: Axes, room: Room, shares: Mapping[tuple[str, str], float]) -> No
                 shrinkA=gap, shrinkB=gap, connectionstyle=f"arc3,rad={bend}",
             )
         )  # fmt: skip
-        x, y = 0.55 * np.array(end) + 0.45 * np.array(start)
+        across, up = np.subtract(end, start)
+        aside = bend / 2 * np.array([up, -across]) if bend else 0.17 / np.hypot(across, up) * np.array([-up, across])
+        x, y = 0.55 * np.array(end) + 0.45 * np.array(start) + aside
         axes.text(
-            x + 0.5 * bend * (end[1] - start[1]), y, f"{share:.2f}", fontsize=8, ha="center", va="center",
+            x, y, f"{share:.2f}", fontsize=8, ha="center", va="center",
             color="tab:blue", bbox={"fc": "white", "ec": "none", "pad": 0.5},
         )  # fmt: skip
     known = {outcome for _, outcome in shares} | {"action"}
