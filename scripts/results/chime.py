@@ -1,6 +1,7 @@
 """Train CHIME in its room, beside a learner whose tasks are given and beside random actions, and look at the claims.
 
     python scripts/results/chime.py [NAME ...] [--seeds 20] [--total 12000] [--runs DIR] [--out DIR] [--docs]
+                                    [--add FILE ...]
 
 NAME is room, given or random, a config of configs/chime; by default all. Each is one run of `star train` with its seeds
 side by side. A run that is done is not made again, and one that was interrupted goes on, so empty `--runs` when code or
@@ -11,8 +12,11 @@ configs have changed. Into `--out`, results/chime by default, go
     room.md      the table of tests, and that of the claims: 95 % bootstrap intervals over seeds
     room_*.png   figures of the run of CHIME
 
-and with `--docs` the pictures of docs/chime.md. A claim that something is better holds if the interval of the
-difference lies on that side of 0; one that names a number, if the mean does.
+and with `--docs` the pictures of docs/chime.md. `--add` takes over what other machines have measured, the learners of
+each FILE, a room.json of theirs; without a NAME none is trained then.
+
+A claim that something is better holds if the interval of the difference lies on that side of 0; one that names a
+number, if the mean does.
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ from scripts.results.claims import Claim, less, mean, ratio, shown, told
 from scripts.results.saht import ROOT, STAR
 from star.config.loading import load_run
 from star.saht.chime.experiment import Chime
-from star.saht.chime.figures import FIRSTS, firsts
+from star.saht.chime.figures import FIRSTS, firsts, kind
 from star.training.figures import save
 from star.training.journal import Journal, by_step
 
@@ -110,15 +114,18 @@ def claims(found: Mapping[str, Any]) -> list[Claim]:
     ):
         share = np.array([in_order(first, count) for first in order])
         made.append(mean(row, text, share, ">= .8", lambda x: x >= 0.8))
+    last = [{kind(model["outcome"], model["control"]) for model in models if model["on"]} for models in room["models"]]
+    text = f"share of learners whose model of an {names[-1]} is on in the end"
+    made.append(mean("ours", text, np.array([float(names[-1] in one) for one in last]), ">= .8", lambda x: x >= 0.8))
     practice = np.asarray(room["practice"]["robot"])
     made.append(less("ours", "share of the robot in practice, last fifth - first", practice[-1], practice[0]))
     tests = {name: {key: np.asarray(value[-1]) for key, value in one["tests"].items()} for name, one in found.items()}
     if "random" in found:
         both = [tests[name]["distance_position"] for name in ("room", "random")]
         made.append(ratio("k", "positions: CHIME / random actions", *both, "<= .5", lambda x: x <= 0.5))
-        for kind in ("wall", "push"):
-            both = [tests[name][f"distance_{kind}"] for name in ("room", "random")]
-            made.append(less("ours", f"{kind}: CHIME - random actions", *both))
+        for test in ("wall", "push"):
+            both = [tests[name][f"distance_{test}"] for name in ("room", "random")]
+            made.append(less("ours", f"{test}: CHIME - random actions", *both))
     if room["timed_s"] is not None:
         text, seconds = f"seconds of {len(whole)} learners for {TIMED:,} actions", np.array([room["timed_s"]])
         made.append(mean("time", text, seconds, f"<= {MOST_SECONDS}", lambda x: x <= MOST_SECONDS))
@@ -137,6 +144,25 @@ def table(found: Mapping[str, Any], made: list[Claim]) -> str:
     return "\n".join([*lines, "", *told(made)]) + "\n"
 
 
+def write(place: Path, found: Mapping[str, Any]) -> None:
+    """The record of all learners, and beside it their tables."""
+    found = {name: found[name] for name in NAMES if name in found}
+    made = claims(found)
+    place.write_text(json.dumps({"claims": [one._asdict() for one in made], "learners": found}) + "\n", "utf-8")
+    place.with_suffix(".md").write_text(table(found, made), encoding="utf-8")
+
+
+def draw(run: Path, options: argparse.Namespace) -> None:
+    """The figures of the run of CHIME."""
+    journal = Journal.of(run, tables="models")
+    drawn = Chime(load_run(run, {})).figures(journal.metrics.read(), journal.tables.read())
+    for figure in FIGURES:
+        if figure in drawn:
+            save(drawn[figure], options.out / f"room_{figure}.png")
+            if options.docs:
+                charts.save(drawn[figure], f"chime_{figure}", dpi=80)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Fill the files."""
     parser = argparse.ArgumentParser(
@@ -148,6 +174,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "chime")
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "chime")
     parser.add_argument("--docs", action="store_true", help="draw the pictures of docs/chime.md")
+    parser.add_argument("--add", type=Path, nargs="+", default=[], metavar="FILE", help="take these learners over")
     options = parser.parse_args(arguments)
     options.runs = options.runs.resolve()
     for name in options.names:
@@ -155,20 +182,15 @@ def main(arguments: list[str] | None = None) -> None:
             raise SystemExit(f"error: {name}: no such learner; known are {', '.join(NAMES)}")
     options.out.mkdir(parents=True, exist_ok=True)
     place = options.out / "room.json"
-    old = json.loads(place.read_text(encoding="utf-8"))["learners"] if place.exists() else {}
-    for name in options.names or NAMES:
-        old[name] = trained(name, options)
-        found = {one: old[one] for one in NAMES if one in old}
-        made = claims(found)
-        place.write_text(json.dumps({"claims": [one._asdict() for one in made], "learners": found}) + "\n", "utf-8")
-        place.with_suffix(".md").write_text(table(found, made), encoding="utf-8")
-        journal = Journal.of(options.runs / name, tables="models")
-        drawn = Chime(load_run(options.runs / name, {})).figures(journal.metrics.read(), journal.tables.read())
-        for figure in FIGURES:
-            if name == "room" and figure in drawn:
-                save(drawn[figure], options.out / f"{name}_{figure}.png")
-                if options.docs:
-                    charts.save(drawn[figure], f"chime_{figure}", dpi=80)
+    found: dict[str, Any] = {}
+    for file in [*[place] * place.exists(), *options.add]:
+        found |= json.loads(file.read_text(encoding="utf-8"))["learners"]
+    write(place, found)
+    for name in options.names or NAMES * (not options.add):
+        found[name] = trained(name, options)
+        write(place, found)
+        if name == "room":
+            draw(options.runs / name, options)
     print(place.with_suffix(".md").read_text(encoding="utf-8"))
 
 

@@ -17,6 +17,7 @@ HELP = "pictures of a task or of an agent"
 DESCRIPTION = """\
 Random actions in TASK, or with --run the greedy policy of a trained agent on test goals.
 Of a world: what its teacher shows, or with --run how a learner reaches goal K of its TASK (--episode K).
+Of a run of CHIME: a test in its room, or with `models` for TASK its graph of models, at each evaluation.
 .png and .jpg hold one picture, of a task its start, of an agent the end of the episode; .mp4, .gif and .html hold all.
 A setting of the task is given as --env.options.KEY VALUE."""
 

@@ -7,9 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
+from envs.worlds.room import Room
 from star.cli import main
 from star.config.loading import parse
+from star.saht.chime import figures
 from star.training import program as programs
 from star.training.journal import JsonLines
 from tests.small import assert_the_same, killed
@@ -100,6 +103,21 @@ def test_what_cannot_be_is_said_in_one_line_and_nothing_is_written(capsys, words
     assert said in line and not Path("new").exists()
 
 
+def test_a_film_shows_the_models_that_are_on_at_each_evaluation(capsys, monkeypatch):
+    drawn, graph = [], figures.graph
+    monkeypatch.setattr(figures, "graph", lambda axes, room, shares: drawn.append(shares) or graph(axes, room, shares))
+    assert main(["render", "models", "--run", "whole", "--seed", "1", "--every", "1", "--out", "models.gif"]) == 0
+    assert "2 pictures; models of seed 1 of whole" in capsys.readouterr().out
+    rows = [row for row in JsonLines(Path("whole/models.jsonl")).read() if row["seed"] == 1]
+    with Image.open("models.gif") as film:
+        assert film.n_frames == len(rows) == len(drawn)
+    figures.hierarchy(Room(1, 0, False), rows[-1:])
+    last, hierarchy = drawn[-2:]
+    assert last.keys() == hierarchy.keys() and 0.5 < last["action", "robot"] < 1 == hierarchy["action", "robot"]
+    assert main(["render", "models", "--run", "whole", "--out", "models.png", "--height", "90"]) == 0
+    assert drawn[-1] != last and "1 picture; models of seed 0" in capsys.readouterr().out
+
+
 def test_pictures_show_a_robot_that_does_a_test(capsys, monkeypatch):
     path = jnp.full((1, 5, 2, 2), 200.0).at[:, :, 1].set(300.0)
     monkeypatch.setattr("star.saht.chime.commands.tested", lambda *_, **__: path)
@@ -107,6 +125,9 @@ def test_pictures_show_a_robot_that_does_a_test(capsys, monkeypatch):
     assert "test 8, push, by whole" in capsys.readouterr().out and Path("push.png").stat().st_size > 1000
     for words, said in (
         (["render", "room", "--run", "whole", "--episode", "99", "--out", "new.png"], "--episode: 99 is not one of"),
+        (["render", "rom", "--run", "whole", "--out", "new.png"], "rom: is not in a run of experiment chime"),
+        (["render", "models", "--run", "whole", "--episode", "1", "--out", "new.png"], "--episode: is for the room"),
+        (["render", "models", "--run", "whole", "--seed", "7", "--out", "new.png"], "--seed: 7 is not among those"),
         (["render", "room", "--camera", "top", "--out", "new.png"], "--camera: is for tasks of experiment star"),
         (["record", "whole", "--out", "new.npz"], "a run of experiment chime makes no demonstrations"),
     ):

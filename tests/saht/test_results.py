@@ -206,3 +206,32 @@ def test_the_page_shows_the_tables_that_were_measured(world):
     page = (ROOT / "docs" / "saht.md").read_text(encoding="utf-8")
     lines = (ROOT / "results" / "saht" / f"{world}.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) > 10 and [line for line in lines if line not in page] == []
+
+
+def robots(distance, *, on, late):
+    """Four learners of CHIME: all have had a model of an object by an object since `late`, `on` have it still."""
+    births = [["robot", "action", 200], ["object_1", "robot", 400], ["object_2", "object_1", late]]
+    last = [{"outcome": outcome, "control": control, "on": True} for outcome, control, _ in births]
+    off = [*last[:2], last[2] | {"on": False}]
+    kinds = ("position", "wall", "push")
+    return {
+        "tests": {f"{what}_{kind}": [[distance] * 4] for what in ("distance", "success") for kind in kinds},
+        "practice": {"robot": [[0.9] * 4, [0.3] * 4]},
+        "births": [births] * 4,
+        "models": [last] * on + [off] * (4 - on),
+        "wall_s": 9.0,
+        "timed_s": 1201.0,
+    }
+
+
+def test_learners_of_two_machines_get_one_table_and_none_is_trained(tmp_path, monkeypatch):
+    script = load("results/chime")
+    monkeypatch.setattr(script.subprocess, "run", lambda *_, **__: pytest.fail("nothing is to be trained"))
+    for name, learner in (("random", robots(100.0, on=0, late=1)), ("room", robots(10.0, on=1, late=6000))):
+        (tmp_path / name).write_text(json.dumps({"claims": [], "learners": {name: learner}}))
+    script.main(["--add", str(tmp_path / "random"), str(tmp_path / "room"), "--out", str(tmp_path / "out")])
+    made = json.loads((tmp_path / "out" / "room.json").read_text())
+    assert list(made["learners"]) == ["room", "random"]
+    assert [claim["holds"] for claim in made["claims"]] == [True, True, False, False, True, True, True, True, False]
+    assert [claim["value"] for claim in made["claims"][:4]] == [1.0, 1.0, 0.0, 0.25]
+    assert (tmp_path / "out" / "room.md").read_text().count("**failed**") == 3

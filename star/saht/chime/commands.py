@@ -1,9 +1,9 @@
-"""CHIME's own commands: pictures of a robot that does a test, beside its models."""
+"""CHIME's own commands: pictures of a robot that does a test, and of its graph of models as it grows."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -15,13 +15,17 @@ from envs.common import modes
 from envs.worlds import draw
 from envs.worlds import room as rooms
 from envs.worlds.room import Errand, Room
-from star.config.loading import load_to_act, parse
+from star.config.loading import load_run, load_to_act, parse
 from star.config.section import ConfigError
 from star.saht.chime import figures
-from star.saht.chime.experiment import tested
+from star.saht.chime.experiment import Chime, tested
 from star.saht.commands import check_flags
 from star.training import program as programs
 from star.training.checkpoint import load_agent
+from star.training.journal import Journal
+
+GRAPH = "models"
+"""The word for `star render` that asks for the graph of models, in the place of the room."""
 
 
 def envs() -> list[str]:
@@ -35,8 +39,12 @@ def record(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
 
 
 def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
-    """Draw a learner that does a test, or random actions."""
+    """Draw a learner that does a test, or random actions; or how the models of a learner have grown."""
     check_flags(options)
+    if options.task == GRAPH:
+        return _render_graph(options, overrides)
+    if options.task not in (None, *envs()):
+        raise ConfigError(f"{options.task}: is not in a run of experiment chime; allowed: room, {GRAPH}")
     if options.run is None:
         values = {"experiment": "chime", "chime": {"tasks": "none"}, "trainer": {"num_seeds": 1}}
         program = programs.build(parse(values, overrides))
@@ -65,8 +73,8 @@ def _pictures(
     room: Room, errand: Errand, path: np.ndarray, models: Sequence[Any], *, every: int, height: int
 ) -> Iterator[np.ndarray]:
     """The room at every so many actions and at the end, beside the models that are on."""
-    shares = {(model["control"], model["outcome"]): model["competence"] for model in models if model["on"]}
-    for step in dict.fromkeys([*range(0, len(path), every), len(path) - 1]):
+    shares = figures.competences(models)
+    for step in _some(len(path), every):
         figure = draw.figure_of(height, 2.4)
         left, right = figure.subplots(1, 2)
         sketch(left, room, path[: step + 1])
@@ -75,6 +83,40 @@ def _pictures(
         off = np.linalg.norm(path[step, errand.disc] - np.array(errand.goal))
         figure.suptitle(f"{errand.kind}: {off:.0f} from the goal", x=0.01, ha="left", size=10, color=draw.INK)
         yield draw.pixels(figure)
+
+
+def _render_graph(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
+    """Draw the models of a learner at each evaluation of its run."""
+    for flag in ("checkpoint", "episode"):
+        if getattr(options, flag) is not None:
+            raise ConfigError(f"--{flag}: is for the room; the film of {GRAPH} shows all evaluations")
+    config = load_run(options.run, overrides)
+    rows = Journal.of(options.run, tables=GRAPH).tables.read()
+    if not rows:
+        raise ConfigError(f"{options.run}: has no evaluation yet, there are no {GRAPH} to show")
+    seeds = sorted({row["seed"] for row in rows})
+    seed = seeds[0] if options.seed is None else options.seed
+    if seed not in seeds:
+        raise ConfigError(f"--seed: {seed} is not among those of {options.run}: {', '.join(map(str, seeds))}")
+    mine = [row for row in rows if row["seed"] == seed]
+    drawn = _graphs(Chime(config).room, mine, every=options.every, height=options.height or 340)
+    written = video.write(options.out, [list(drawn)[-1]] if video.is_still(options.out) else drawn, fps=options.fps)
+    print(f"{options.out}: {written} picture{'s' * (written > 1)}; {GRAPH} of seed {seed} of {options.run}")
+    return 0
+
+
+def _graphs(room: Room, rows: Sequence[Any], *, every: int, height: int) -> Iterator[np.ndarray]:
+    """The models that are on, with their competence, at every so many evaluations and at the last."""
+    for number in _some(len(rows), every):
+        figure = draw.figure_of(height, 1.5)
+        figures.graph(figure.subplots(), room, figures.competences(rows[number]["models"]))
+        figure.suptitle(f"{rows[number]['env_steps']:,} actions", x=0.01, ha="left", size=10, color=draw.INK)
+        yield draw.pixels(figure)
+
+
+def _some(count: int, every: int) -> Iterable[int]:
+    """Every so many of the first numbers, and the last."""
+    return dict.fromkeys([*range(0, count, every), count - 1])
 
 
 def sketch(axes: Any, room: Room, path: np.ndarray) -> None:

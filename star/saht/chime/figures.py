@@ -39,15 +39,16 @@ def figures(room: Room, rows: Sequence[Row], tables: Sequence[Row]) -> dict[str,
     return found
 
 
+def kind(outcome: str, control: str) -> str:
+    """The one of `FIRSTS` that a model with this outcome and control is."""
+    return outcome if outcome == "robot" else "object" if control in ("action", "robot") else "object by object"
+
+
 def firsts(pairs: Births) -> dict[str, int]:
     """The action at which a model of the robot, of an object and of an object by an object was first born, if ever.
 
     `pairs` are an outcome, its control and the first birth.
     """
-
-    def kind(outcome: str, control: str) -> str:
-        return outcome if outcome == "robot" else "object" if control in ("action", "robot") else "object by object"
-
     found: dict[str, int] = {}
     for outcome, control, action in pairs:
         name = kind(outcome, control)
@@ -137,11 +138,16 @@ def hierarchy(room: Room, last: Sequence[Row]) -> Figure:
     """The models that are on in the end: arrows lead from the control, with the share of learners as a label."""
     count: dict[tuple[str, str], float] = {}
     for row in last:
-        for pair in {(model["control"], model["outcome"]) for model in row["models"] if model["on"]}:
+        for pair in competences(row["models"]):
             count[pair] = count.get(pair, 0.0) + 1 / len(last)
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     graph(figure.subplots(), room, count)
     return figure
+
+
+def competences(models: Sequence[Row]) -> dict[tuple[str, str], float]:
+    """Of the models that are on: control and outcome, and the competence."""
+    return {(model["control"], model["outcome"]): model["competence"] for model in models if model["on"]}
 
 
 def graph(axes: Axes, room: Room, shares: Mapping[tuple[str, str], float]) -> None:
@@ -153,16 +159,18 @@ def graph(axes: Axes, room: Room, shares: Mapping[tuple[str, str], float]) -> No
     places |= {name: (1.0, -1.0 - i) for i, name in enumerate(others)}
     for (control, outcome), share in shares.items():
         start, end = places[control], places[outcome]
-        bend = 0.35 if start[0] == end[0] else 0.0
+        bend, gap = (0.35, 14) if start[0] == end[0] else (0.0, 29)  # names are wider than high
         axes.add_patch(
             FancyArrowPatch(
                 start, end, arrowstyle="-|>", mutation_scale=14, color="black", alpha=0.2 + 0.8 * min(share, 1.0),
-                shrinkA=32, shrinkB=32, connectionstyle=f"arc3,rad={bend}",
+                shrinkA=gap, shrinkB=gap, connectionstyle=f"arc3,rad={bend}",
             )
         )  # fmt: skip
-        x, y = 0.55 * np.array(end) + 0.45 * np.array(start)
+        across, up = np.subtract(end, start)
+        aside = bend / 2 * np.array([up, -across]) if bend else 0.17 / np.hypot(across, up) * np.array([-up, across])
+        x, y = 0.55 * np.array(end) + 0.45 * np.array(start) + aside
         axes.text(
-            x + 0.5 * bend * (end[1] - start[1]), y, f"{share:.2f}", fontsize=8, ha="center", va="center",
+            x, y, f"{share:.2f}", fontsize=8, ha="center", va="center",
             color="tab:blue", bbox={"fc": "white", "ec": "none", "pad": 0.5},
         )  # fmt: skip
     known = {outcome for _, outcome in shares} | {"action"}
@@ -173,7 +181,7 @@ def graph(axes: Axes, room: Room, shares: Mapping[tuple[str, str], float]) -> No
             bbox={"boxstyle": "round", "fc": "white", "ec": ink},
         )  # fmt: skip
     rows = [y for _, y in places.values()]
-    axes.set(xlim=(-0.4, 2.8), ylim=(min(rows) - 0.6, max(rows) + 0.6), title="models that are on")
+    axes.set(xlim=(-0.4, 2.5), ylim=(min(rows) - 0.6, max(rows) + 0.6), title="models that are on")
     axes.axis("off")
 
 

@@ -106,7 +106,7 @@ class ChimeTrainer(TrainerConfig):
     """The host loop around the jitted epoch."""
 
     total_env_steps: Annotated[int, Field(gt=0, lt=2**24)] = setting(
-        5000, "Each seed does so many actions; the last epoch is finished.", unit="actions"
+        12_000, "Each seed does so many actions; the last epoch is finished.", unit="actions"
     )
     eval_every: Positive = setting(25, "An evaluation follows every so many epochs.", unit="epochs")
     checkpoint_every: Positive = setting(25, "A checkpoint is written every so many epochs.", unit="epochs")
