@@ -129,7 +129,8 @@ def test_the_reason_of_a_failure_is_the_first_that_holds():
     position = rng.normal(size=(9, 60, 2)).cumsum(axis=0)
     success_any, *mishaps = (rng.random((4, 60)) < [[0.2], [0.3], [0.3], [0.1]]).astype(float)
     holds = dict(zip(MISHAPS, mishaps, strict=True))
-    ended = Episode.start(jnp.zeros(60)).replace(success_any=jnp.asarray(success_any), **jax.tree.map(jnp.asarray, holds))
+    happened = jax.tree.map(jnp.asarray, {"success_any": success_any, **holds})
+    ended = Episode.start(jnp.zeros(60)).replace(**happened)
     found = measured(ended, position, np.zeros((9, 60)), radius=2.5)
 
     def slow(e):
