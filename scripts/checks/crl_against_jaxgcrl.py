@@ -49,7 +49,7 @@ HEIGHT = 2  # index of an observation
 
 
 class Parts(struct.PyTreeNode):
-    """What JaxGCRL's updates read of its state, and write."""
+    """The parts of JaxGCRL's state that its updates read and write."""
 
     actor_state: TrainState
     critic_state: TrainState
@@ -57,7 +57,7 @@ class Parts(struct.PyTreeNode):
 
 
 class Batch(NamedTuple):
-    """What JaxGCRL's losses read of a batch."""
+    """The parts of a batch that JaxGCRL's losses read."""
 
     observation: jax.Array
     action: jax.Array
@@ -144,7 +144,7 @@ def _apart(wanted: jax.Array, found: jax.Array) -> float:
 
 
 def lives(env: Any, actions: Callable[[jax.Array, jax.Array], jax.Array]) -> dict[str, int]:
-    """What becomes of ants that begin together and act by `actions(observations, key)`, none of which begins anew."""
+    """Counts of ants that begin together and act by `actions(observations, key)`; none begins anew."""
 
     def step(carry: Any, key: jax.Array) -> tuple[Any, Any]:
         state, alive = carry
