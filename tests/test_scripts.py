@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -19,13 +20,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import envs
+from envs._quiet import State
 from envs.arena import Arena
 from star.abstraction import reachability
 from star.abstraction.forward_model import Outcome
 from star.abstraction.reachability import MISSES, REACHES
 from star.agent.decisions import Decision
 from star.config import loading
-from star.learners import replay
+from star.learners import crl, replay
+from star.learners.sections import CRLConfig
 from star.spec import Spec
 from star.training import program as programs
 from star.training.checkpoint import Checkpoints, Damaged
@@ -74,6 +77,35 @@ def test_the_check_against_jaxgcrl_gives_each_motor_its_own_action_and_counts_co
         np.testing.assert_allclose(after[i], [*data.qpos, *data.qvel], atol=1e-5)
     before[1, 0] = 28.0
     assert script.touching(model, before) == {"walls": 1, "itself": 0}
+
+
+def test_lives_are_counted_until_the_first_end_and_by_its_reason(monkeypatch):
+    script = load("checks/crl_against_jaxgcrl")
+    monkeypatch.setattr(script, "ENVS", 3)
+    monkeypatch.setattr(script, "STEPS", 10)
+
+    def at(height):
+        zero = jnp.zeros(())
+        return State(None, jnp.zeros(3).at[2].set(height), zero, jnp.float32((height < 0.2) | (height > 1)), {})
+
+    climber = argparse.Namespace(reset=lambda key: at(0.5), step=lambda state, action: at(state.obs[2] + action))
+    found = script.lives(climber, lambda obs, key: jnp.asarray([0.2, -0.2, 0.0]))  # 1.1 m in step 3, .1 m in step 2
+    assert found == {"env_steps": 3 + 2 + 10, "ends": 2, "high": 1}
+
+
+def test_the_last_layer_of_our_actor_is_two_of_jaxgcrls():
+    rng, sizes = np.random.default_rng(0), (3, 4, 4, 6)
+    layer = lambda n, m: {"kernel": rng.normal(size=(n, m)), "bias": rng.normal(size=m)}  # noqa: E731
+    actor = {"params": {f"Dense_{i}": layer(*sizes[i : i + 2]) for i in range(3)}}
+    x = rng.normal(size=(5, 3))
+    mean, std = crl._policy(CRLConfig(hidden=(4, 4)), jax.tree.map(jnp.float32, actor), jnp.float32(x))
+    *hidden, means, raw = load("checks/crl_against_jaxgcrl").as_theirs(actor)["params"].values()
+    for one in hidden:
+        x = x @ one["kernel"] + one["bias"]
+        x = x / (1 + np.exp(-x))
+    np.testing.assert_allclose(x @ means["kernel"] + means["bias"], mean, rtol=1e-4)
+    log_std = -5 + 3.5 * (np.tanh(x @ raw["kernel"] + raw["bias"]) + 1)
+    np.testing.assert_allclose(np.exp(log_std), std, rtol=1e-4)
 
 
 def test_the_benchmark_measures_both_loops():

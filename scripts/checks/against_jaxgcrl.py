@@ -59,20 +59,20 @@ class Seen(NamedTuple):
     done: np.ndarray
 
 
-def loaded(clone: Path, name: str) -> ModuleType:
-    """The module `name` of its environments, without the packages that it needs otherwise."""
-    spec = importlib.util.spec_from_file_location(name, clone / "jaxgcrl" / "envs" / f"{name}.py")
+def loaded(clone: Path, name: str, *, folder: str = "envs") -> ModuleType:
+    """The module `name` of its environments or another folder, without the packages that it needs otherwise."""
+    spec = importlib.util.spec_from_file_location(name, clone / "jaxgcrl" / folder / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
 
 
-def theirs(clone: Path, task: str) -> tuple[Any, np.ndarray]:
+def theirs(clone: Path, task: str, *, backend: str = "mjx") -> tuple[Any, np.ndarray]:
     """Its environment, and the place of its start."""
     if task == "ant":
-        return loaded(clone, "ant").Ant(backend="mjx"), np.zeros(2)
-    env = loaded(clone, "ant_maze").AntMaze(backend="mjx", maze_layout_name=task.removeprefix("ant_"))
+        return loaded(clone, "ant").Ant(backend=backend), np.zeros(2)
+    env = loaded(clone, "ant_maze").AntMaze(backend=backend, maze_layout_name=task.removeprefix("ant_"))
     return env, np.asarray(env.possible_starts[0])
 
 

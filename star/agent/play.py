@@ -51,9 +51,9 @@ class Episode(struct.PyTreeNode):
     """Env steps after which the goal counts as reached."""
 
     @classmethod
-    def start(cls, num_envs: int) -> Episode:
-        """Before the first step."""
-        return cls(*(jnp.zeros(num_envs) for _ in range(8)))
+    def start(cls, distance: Float[Array, "B"]) -> Episode:
+        """Before the first step, `distance` m from the goal."""
+        return cls(*[jnp.zeros_like(distance)] * 8).replace(distance=distance)
 
     def after(self, env_state: EnvState, alive: Float[Array, "B"]) -> Episode:
         """With one more env step, to `env_state`, of those that were `alive`."""
@@ -133,7 +133,7 @@ def start(
         env_state = env.with_goals(env_state, goals, jnp.ones(env.num_envs, bool))
     position = agent.task.spec.abstract(env_state.obs)
     memory = agent.commander.begin(agent.config.commander, position, decisions=decisions, key=practice_key)
-    return Streams(env=env_state, memory=memory, lesson=(), episode=Episode.start(env.num_envs))
+    return Streams(env=env_state, memory=memory, lesson=(), episode=Episode.start(env_state.metrics["distance"]))
 
 
 def segment(
@@ -232,5 +232,5 @@ def restart_ended(agent: Agent, env: VectorEnv, streams: Streams, passed: Segmen
         agent.config.sgim, agent.task.spec, env, streams.lesson, env_state, ended, distance=streams.episode.distance
     )
     clock = jnp.where(ended, 0, streams.memory.clock)
-    episode = where(ended, Episode.start(env.num_envs), streams.episode)
+    episode = where(ended, Episode.start(env_state.metrics["distance"]), streams.episode)
     return Streams(env=env_state, memory=streams.memory.replace(clock=clock), lesson=lesson, episode=episode)

@@ -129,7 +129,8 @@ def test_the_reason_of_a_failure_is_the_first_that_holds():
     position = rng.normal(size=(9, 60, 2)).cumsum(axis=0)
     success_any, *mishaps = (rng.random((4, 60)) < [[0.2], [0.3], [0.3], [0.1]]).astype(float)
     holds = dict(zip(MISHAPS, mishaps, strict=True))
-    ended = Episode.start(60).replace(success_any=jnp.asarray(success_any), **jax.tree.map(jnp.asarray, holds))
+    happened = jax.tree.map(jnp.asarray, {"success_any": success_any, **holds})
+    ended = Episode.start(jnp.zeros(60)).replace(**happened)
     found = measured(ended, position, np.zeros((9, 60)), radius=2.5)
 
     def slow(e):
@@ -149,7 +150,7 @@ def test_time_and_way_count_until_the_goal_is_first_reached():
     rng = np.random.default_rng(0)
     position = rng.normal(size=(7, 40, 2)).cumsum(axis=0)
     success = (rng.random((7, 40)) < 0.15).astype(float)
-    ended = Episode.start(40)
+    ended = Episode.start(jnp.zeros(40))
     found = measured(ended, position, success)
     for e in range(40):
         steps, path = 0, 0.0
@@ -163,7 +164,7 @@ def test_time_and_way_count_until_the_goal_is_first_reached():
 
 def test_the_shortest_way_ends_where_the_goal_counts_as_reached(run):
     course = exams.prepare(config_of(run), Exam(), episodes=1, source=run)
-    trials = measured(Episode.start(2), np.zeros((2, 2, 2)), np.zeros((2, 2)))
+    trials = measured(Episode.start(jnp.zeros(2)), np.zeros((2, 2, 2)), np.zeros((2, 2)))
     trials = trials.replace(goal=np.array([[0.0, 16.0], [3.0, 0.0]]))
     np.testing.assert_allclose(exams.shortest_ways(course, trials), [2 * np.hypot(12, 4) + 8 - 5, 0.0])
 
@@ -171,7 +172,7 @@ def test_the_shortest_way_ends_where_the_goal_counts_as_reached(run):
 def test_a_goal_is_behind_a_wall_unless_who_goes_straight_on_comes_within_its_reach(run):
     course = exams.prepare(config_of(run), Exam(), episodes=1, source=run)
     goals = np.array([[0.0, 16.0], [3.0, 0.0], [0.0, 8.9], [0.0, 9.1], [16.0, 0.0]])
-    trials = measured(Episode.start(5), np.zeros((2, 5, 2)), np.zeros((2, 5))).replace(goal=goals)
+    trials = measured(Episode.start(jnp.zeros(5)), np.zeros((2, 5, 2)), np.zeros((2, 5))).replace(goal=goals)
     behind = exams.behind_walls(course, trials)
     assert behind.tolist() == [True, False, False, True, False]  # the wall begins at y = 4, success 5 m before a goal
     reached = trials.episode.replace(success_any=np.array([1.0, 1.0, 0.0, 0.0, 0.0]))

@@ -181,6 +181,14 @@ def test_an_environment_that_ended_is_reset_and_no_other_is(recording):
             np.testing.assert_array_equal(now, before)
 
 
+def test_an_episode_that_has_just_begun_counts_as_far_from_its_goal_as_its_start(recording):
+    obs = recording.before.env.obs
+    away = np.linalg.norm(obs[..., :2] - obs[..., 4:6], axis=-1)
+    begun = recording.before.env.info["steps"] == 0
+    assert begun[1:].any()
+    np.testing.assert_allclose(recording.before.episode.distance[begun], away[begun], rtol=1e-5)
+
+
 def test_episode_statistics_are_those_of_the_steps_since_the_last_reset(recording):
     any_, total, there = np.zeros(B), np.zeros(B), np.zeros(B)
     for i, b in streams_and_segments(recording):
