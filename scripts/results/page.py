@@ -211,7 +211,6 @@ def page(rows: Mapping[str, Row]) -> str:
 
 Bars are means over seeds, lines 95 % intervals. Differences have Welch's interval. GARA here is STAR without its Tutor.
 {f"Not measured: {missing}." if missing else ""}
-Older figures of HIRO are in the [notebook](notebook/results.md#hiro-and-hrac-anew).
 
 ![Success of STAR and GARA over env steps](images/results_curves.png)
 

@@ -43,7 +43,7 @@ Planes = Float[Array, "R d planes"]
 
 
 class Ways(NamedTuple):
-    """What N agents did, each told by K points."""
+    """The ways of N agents, each told by K points."""
 
     point: Float[Array, "K N d"]
     region: Int[Array, "K N"]

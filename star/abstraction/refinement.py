@@ -201,16 +201,13 @@ def refine(
     (abstraction, graph), (splits, found, mixed) = jax.lax.scan(
         one_pair, (abstraction, graph), jax.random.split(key, config.refinement.pairs_per_epoch)
     )
-    splits, separated = jax.tree.map(jnp.ravel, splits), jnp.zeros((), jnp.int32)
-    if config.refinement.separate:
-        abstraction, graph, more = _separate(config, abstraction, graph, periods, goals, met)
-        splits = jax.tree.map(lambda *both: jnp.concatenate(both), splits, more)
-        separated = more.done.sum()
+    abstraction, graph, more = _separate(config, abstraction, graph, periods, goals, met)
+    splits = jax.tree.map(lambda x, other: jnp.concatenate([x.reshape(-1), other]), splits, more)
     metrics = {
         "examined": found.sum(),
         "mixed": mixed.sum(),
         "splits": splits.done.sum(),
-        "separated": separated,
+        "separated": more.done.sum(),
         "edges": graph.reaches.sum(),
         "misses": graph.misses.sum(),
         "table_full": (abstraction.count == abstraction.capacity).astype(jnp.int32),
@@ -221,7 +218,10 @@ def refine(
 def _separate(
     config: Settings, abstraction: Abstraction, graph: Graph, periods: Outcome, goals: Outcome, met: Bool[Array, "N"]
 ) -> tuple[Abstraction, Graph, Split]:
-    """Cut regions where nobody passes, those first in which most move on either side."""
+    """Cut regions where nobody passes, if that is wanted, those first in which most move on either side."""
+    if not config.refinement.separate:
+        none = jnp.zeros(0, jnp.int32)
+        return abstraction, graph, Split(done=none > 0, cut=Cut(none, none, jnp.zeros(0)), child=none)
     cuts, evidence = passages.cuts(abstraction, periods, goals, met, min_width=config.abstraction.min_width)
     worst = jnp.argsort(-evidence)[:_SEPARATED]
 

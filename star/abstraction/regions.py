@@ -208,7 +208,7 @@ def over_parts(table: Float[Array, "*R"], origin: Int[Array, "R"]) -> Float[Arra
 
 
 def inherit(table: Array, origin: Int[Array, "R"], *, axes: Sequence[int] | None = None) -> Array:
-    """What `table` holds, along its `axes` of regions (None: all), by regions of which j was cut from `origin` [j]."""
+    """The `table` of regions of which j was cut from `origin` [j], along its `axes` of regions (None: all)."""
     for axis in range(table.ndim) if axes is None else axes:
         table = jnp.take(table, origin, axis=axis, mode="clip")
     return table
