@@ -28,7 +28,7 @@ def test_a_larger_buffer_needs_as_many_more_transitions():
     [
         {"controller.learner": "td3", "controller.td3.buffer_size": 2**31 - 1, "trainer.num_seeds": 1024},
         {"trainer.num_envs": 2**20, "trainer.num_seeds": 1024},
-        {"controller.ppo.hidden": [2**16] * 64},
+        {"controller.ppo.hidden": [2**14] * 16, "trainer.num_seeds": 64},
     ],
 )
 def test_a_run_that_cannot_fit_is_refused_before_anything_is_written(tmp_path, overrides):
