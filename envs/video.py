@@ -43,6 +43,21 @@ def is_still(path: Path) -> bool:
     return path.suffix.lower() in STILLS
 
 
+def sampled(count: int, every: int) -> list[int]:
+    """Every `every`th of the first `count` numbers, and the last of them."""
+    return sorted({*range(0, count, every), count - 1})
+
+
+def moments(path: Path, count: int, *, every: int) -> list[int]:
+    """The moments that `path` shows, of `count`: the last one in a still, else every `every`th and the last one."""
+    return [count - 1] if is_still(path) else sampled(count, every)
+
+
+def told(path: Path, written: int) -> str:
+    """The words for so many pictures in `path`."""
+    return f"{path}: {written} picture{'s' * (written > 1)}"
+
+
 def write(path: Path, pictures: Iterable[np.ndarray], *, fps: float = 20.0) -> int:
     """Write pictures (uint8 [h, w, 3], all of one size), `fps` of them a second; returns how many there were.
 

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from envs import video
 from envs.worlds.world import World, sole
 
 DPI = 100
@@ -59,7 +60,7 @@ def film(
 ) -> Iterator[np.ndarray]:
     """A still after every so many control steps of the first `length` primitives, by default of all, and the last."""
     steps = len(jax.tree.leaves(trace.path)[0]) * (length or world.longest) // world.longest
-    for step in dict.fromkeys([*range(0, steps, every), steps - 1]):
+    for step in video.sampled(steps, every):
         yield still(world, trace, step=step, task=task, goal=goal, height=height)
 
 

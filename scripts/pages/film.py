@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from PIL import Image
 
+from envs import video
 from envs.common.errors import UserError
 from scripts.pages import charts
 from star.agent import films
@@ -57,9 +58,8 @@ def make(agent: str, out: Path, *, seed: int, every: int, height: int) -> dict[s
     )
     moments = recording.moments
     show = films.Show(out, every=every, height=height, camera="follow")
-    pictures = [
-        Image.fromarray(one) for one in films.draw(recording, show, films.moments_shown(len(moments.obs), show))
-    ]
+    times = video.moments(out, len(moments.obs), every=every)
+    pictures = [Image.fromarray(one) for one in films.draw(recording, show, times)]
     told = {
         "agent": Path(agent).name,
         "seconds": round((len(moments.obs) - 1) * recording.env.dt, 1),

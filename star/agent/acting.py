@@ -205,7 +205,7 @@ class TrainedAgent:
 def load(run_dir: Path, *, checkpoint: str = "last", seed: int | None = None) -> TrainedAgent:
     """The agent of `seed` (None: the first) in a checkpoint of a run; raises `UserError`, as `star.load` does."""
     program = programs.build(load_to_act(run_dir, {}))
-    number = saved.agent_number(program, run_dir, seed)
+    number = saved.agent_number(program.seeds, run_dir, seed)
     env_steps, states = saved.load_state(program, run_dir, checkpoint)
     state = jax.tree.map(lambda leaf: leaf[number], states)
     return TrainedAgent(program, state, run_dir=run_dir, env_steps=env_steps, seed=program.seeds[number])

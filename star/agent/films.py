@@ -120,11 +120,11 @@ def render(
                 exam=exam,
                 number=episode,
             )
-        times = moments_shown(len(recording.moments.obs), show)
+        times = video.moments(show.out, len(recording.moments.obs), every=show.every)
         progress.update(task, description="drawing", total=len(times), since=None)
         pictures = _ticking(draw(recording, show, times), progress, task)
         written = video.write(show.out, pictures, fps=show.fps)
-    return f"{show.out}: {written} picture{'s' * (written > 1)}{_outcome(recording)}"
+    return video.told(show.out, written) + _outcome(recording)
 
 
 def record_random(config: Config, *, envs: int, steps: int | None, seed: int) -> Recording:
@@ -170,7 +170,7 @@ def record_run(
     program, env, spec = course.program, course.env, course.spec
     goal_env.need(env, "star render", *goal_env.DRAWN)
     length = _length(spec.episode_length, steps)
-    index = agent_number(program, run_dir, agent)
+    index = agent_number(program.seeds, run_dir, agent)
     _, states = load_state(program, run_dir, checkpoint)
     keys = program.evaluation_keys(exam.seed, stream=programs.AFTERWARDS)
     shown = slice(0, envs) if number is None else slice(number, number + 1)
@@ -203,13 +203,6 @@ def record_run(
     count = int(state.abstraction.count)
     regions = np.asarray(state.abstraction.lower[:count]), np.asarray(state.abstraction.upper[:count])
     return Recording(env, moments, regions if config.commander.enabled else None)
-
-
-def moments_shown(total: int, show: Show) -> list[int]:
-    """The moments that are drawn, of `total`: the last one for a still, else every `every`th and the last one."""
-    if video.is_still(show.out):
-        return [total - 1]
-    return sorted({*range(0, total, show.every), total - 1})
 
 
 def draw(recording: Recording, show: Show, times: list[int]) -> Iterator[np.ndarray]:

@@ -49,7 +49,7 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
         sequence, length = memory.sequences[row], memory.lengths[row]
     trace = world.trace(sequence, length, key=modes.key(options.evaluation_seed))
     written = video.write(options.out, _pictures(options, world, trace, int(length), task, goal), fps=options.fps)
-    print(f"{options.out}: {written} picture{'s' * (written > 1)}; {world.names[task]} by {how}")
+    print(f"{video.told(options.out, written)}; {world.names[task]} by {how}")
     return 0
 
 

@@ -18,7 +18,7 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -336,21 +336,19 @@ def load_agent(
     `seed` is the one that a user chose for the evaluation.
     """
     program = programs.build(config)
-    number = agent_number(program, run_dir, agent)
+    number = agent_number(program.seeds, run_dir, agent)
     _, states = load_state(program, run_dir, checkpoint)
     key = program.evaluation_keys(seed, stream=programs.AFTERWARDS)[number]
     return program, jax.tree.map(lambda leaf: leaf[number], states), key
 
 
-def agent_number(program: Program, run_dir: Path, agent: int | None) -> int:
-    """Index of the agent of `run_dir` with the seed `agent` (None: the first)."""
+def agent_number(seeds: Sequence[int], run_dir: Path, agent: int | None) -> int:
+    """Index of the seed `agent` (None: the first) among the `seeds` of `run_dir`; raises `UserError` if it is none."""
     if agent is None:
         return 0
-    if agent not in program.seeds:
-        raise ConfigError(
-            f"--seed: {agent} is not among those of {agents.told(run_dir)}: {', '.join(map(str, program.seeds))}"
-        )
-    return program.seeds.index(agent)
+    if agent not in seeds:
+        raise ConfigError(f"--seed: {agent} is not among those of {agents.told(run_dir)}: {', '.join(map(str, seeds))}")
+    return seeds.index(agent)
 
 
 def _kind(about: About) -> Kind:

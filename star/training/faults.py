@@ -87,7 +87,7 @@ def slower(tree: Tree, factors: Sequence[float]) -> Tree:
 
 
 def _not_finite(tensors: list[jax.Array]) -> jax.Array:
-    """Count of numbers not finite. Small tensors are looked through as one, which compiles in a fifth of the time."""
+    """Count of numbers not finite. Small tensors are looked through as one, which compiles sooner."""
     small = [tensor for tensor in tensors if tensor.size <= _SMALL]
     large = [tensor for tensor in tensors if tensor.size > _SMALL]
     together = [jnp.concatenate(small)] if small else []

@@ -17,7 +17,7 @@ from PIL import Image
 from rich.console import Console
 
 import envs
-from envs import EnvError, opengl
+from envs import EnvError, opengl, video
 from envs.common.errors import UserError
 from star import cli
 from star.agent import exams, films
@@ -120,7 +120,7 @@ def test_after_its_end_an_environment_stays_as_it_was():
     ],
 )
 def test_a_still_shows_the_end_and_a_film_every_nth_moment_and_the_end(out, every, total, shown):
-    assert films.moments_shown(total, Show(out=Path(out), every=every)) == shown
+    assert video.moments(Path(out), total, every=every) == shown
 
 
 @pytest.mark.parametrize(("count", "across", "down"), [(1, 1, 1), (2, 1, 2), (4, 2, 2), (6, 3, 2)])

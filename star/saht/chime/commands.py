@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ from star.saht.chime import figures
 from star.saht.chime.experiment import Chime, tested
 from star.saht.commands import check_flags
 from star.training import program as programs
-from star.training.checkpoint import load_agent
+from star.training.checkpoint import agent_number, load_agent
 from star.training.journal import Journal
 
 GRAPH = "models"
@@ -63,18 +63,19 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     path = np.asarray(tested(program.hyper, experiment.room, [errand], state, key=key)[0])
     (table,) = experiment.tables(program.hyper, jax.tree.map(lambda leaf: leaf[None], state), [options.seed or 0])
     height = options.height or 340
-    drawn = _pictures(experiment.room, errand, path, table["models"], every=options.every, height=height)
-    written = video.write(options.out, [list(drawn)[-1]] if video.is_still(options.out) else drawn, fps=options.fps)
-    print(f"{options.out}: {written} picture{'s' * (written > 1)}; test {number}, {errand.kind}, by {how}")
+    steps = video.moments(options.out, len(path), every=options.every)
+    drawn = _pictures(experiment.room, errand, path, table["models"], steps=steps, height=height)
+    written = video.write(options.out, drawn, fps=options.fps)
+    print(f"{video.told(options.out, written)}; test {number}, {errand.kind}, by {how}")
     return 0
 
 
 def _pictures(
-    room: Room, errand: Errand, path: np.ndarray, models: Sequence[Any], *, every: int, height: int
+    room: Room, errand: Errand, path: np.ndarray, models: Sequence[Any], *, steps: Sequence[int], height: int
 ) -> Iterator[np.ndarray]:
-    """The room at every so many actions and at the end, beside the models that are on."""
+    """The room after so many `steps`, beside the models that are on."""
     shares = figures.competences(models)
-    for step in _some(len(path), every):
+    for step in steps:
         figure = draw.figure_of(height, 2.4)
         left, right = figure.subplots(1, 2)
         sketch(left, room, path[: step + 1])
@@ -94,29 +95,22 @@ def _render_graph(options: argparse.Namespace, overrides: dict[str, Any]) -> int
     rows = Journal.of(options.run, tables=GRAPH).tables.read()
     if not rows:
         raise ConfigError(f"{options.run}: has no evaluation yet, there are no {GRAPH} to show")
-    seeds = sorted({row["seed"] for row in rows})
-    seed = seeds[0] if options.seed is None else options.seed
-    if seed not in seeds:
-        raise ConfigError(f"--seed: {seed} is not among those of {options.run}: {', '.join(map(str, seeds))}")
+    seeds = programs.seeds_of(config)
+    seed = seeds[agent_number(seeds, options.run, options.seed)]
     mine = [row for row in rows if row["seed"] == seed]
-    drawn = _graphs(Chime(config).room, mine, every=options.every, height=options.height or 340)
-    written = video.write(options.out, [list(drawn)[-1]] if video.is_still(options.out) else drawn, fps=options.fps)
-    print(f"{options.out}: {written} picture{'s' * (written > 1)}; {GRAPH} of seed {seed} of {options.run}")
+    shown = [mine[number] for number in video.moments(options.out, len(mine), every=options.every)]
+    written = video.write(options.out, _graphs(Chime(config).room, shown, options.height or 340), fps=options.fps)
+    print(f"{video.told(options.out, written)}; {GRAPH} of seed {seed} of {options.run}")
     return 0
 
 
-def _graphs(room: Room, rows: Sequence[Any], *, every: int, height: int) -> Iterator[np.ndarray]:
-    """The models that are on, with their competence, at every so many evaluations and at the last."""
-    for number in _some(len(rows), every):
+def _graphs(room: Room, rows: Sequence[Any], height: int) -> Iterator[np.ndarray]:
+    """The models that are on at each evaluation, with their competence."""
+    for row in rows:
         figure = draw.figure_of(height, 1.5)
-        figures.graph(figure.subplots(), room, figures.competences(rows[number]["models"]))
-        figure.suptitle(f"{rows[number]['env_steps']:,} actions", x=0.01, ha="left", size=10, color=draw.INK)
+        figures.graph(figure.subplots(), room, figures.competences(row["models"]))
+        figure.suptitle(f"{row['env_steps']:,} actions", x=0.01, ha="left", size=10, color=draw.INK)
         yield draw.pixels(figure)
-
-
-def _some(count: int, every: int) -> Iterable[int]:
-    """Every so many of the first numbers, and the last."""
-    return dict.fromkeys([*range(0, count, every), count - 1])
 
 
 def sketch(axes: Any, room: Room, path: np.ndarray) -> None:
