@@ -308,7 +308,7 @@ def test_debug_turns_the_checks_on_with_and_without_goal_selection(tmp_path, mon
 
 def test_arrays_of_another_shape_or_type_than_said_are_refused():
     @jaxtyped(typechecker=debugging.shapes)
-    def scaled(x: Float[Array, "n d"], by: Float[Array, "d"] | float) -> Float[Array, "n d"]:
+    def scaled(x: Float[Array, "n d"], by: Float[Array, "d"] | float) -> Float[Array, "n d"]:  # noqa: F821
         return x * by
 
     x = jnp.zeros((3, 2))
