@@ -142,14 +142,20 @@ class Tutoring(Experiment):
         return {"discovery.students": 4 * seeds * section.students * section.exercises * tracing.FEATURES * skills}
 
 
-def earlier_scores(hyper: Any, course: Course, *, key: Array) -> Scores:
-    """Those of students of `course` who chose exercises at random, each with its own preferences among skills."""
+def earlier_scores(hyper: Any, course: Course, *, withheld: Int[Array, "P"] | None = None, key: Array) -> Scores:
+    """Those of students of `course` who chose exercises at random, each with its own preferences among skills.
+
+    None chose an exercise that needs the skill `withheld` from it, if there is another exercise.
+    """
     section = hyper.discovery
     student_key, taste_key, exercise_key, key = random.split(key, 4)
     students = _new_students(hyper, section.students, key=student_key)
     shape = (section.exercises, section.students)
     taste = section.preference * random.normal(taste_key, (section.students, hyper.course.skills))
-    exercises = random.categorical(exercise_key, taste @ course.needs.T, shape=shape)
+    odds = taste @ course.needs.T
+    if withheld is not None:
+        odds = jnp.where(course.needs[:, withheld].T, -jnp.inf, odds)
+    exercises = random.categorical(exercise_key, odds, shape=shape)
 
     def step(students: Student, given: tuple[Array, Array]) -> tuple[Student, Array]:
         exercise, key = given
@@ -158,6 +164,13 @@ def earlier_scores(hyper: Any, course: Course, *, key: Array) -> Scores:
     right = jax.lax.scan(step, students, (exercises, random.split(key, section.exercises)))[1]
     number = jnp.broadcast_to(jnp.arange(section.students), shape)
     return Scores(student=number.T.ravel(), exercise=exercises.T.ravel(), right=right.T.ravel())
+
+
+def withheld_scores(hyper: Any, course: Course, *, key: Array) -> tuple[Int[Array, "P"], Scores]:
+    """The skill withheld from each of the earlier students, and their scores: each from as many, drawn by lot."""
+    lot_key, key = random.split(key)
+    withheld = random.permutation(lot_key, jnp.arange(hyper.discovery.students) % hyper.course.skills)
+    return withheld, earlier_scores(hyper, course, withheld=withheld, key=key)
 
 
 def _graph(hyper: Any, course: Course, *, key: Array) -> tuple[Bool[Array, "n n"], Found]:
