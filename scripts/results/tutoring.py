@@ -1,10 +1,15 @@
 """Compare tutors, and see how well prerequisites are found: the tables of docs/tutoring.md.
 
-    python scripts/results/tutoring.py [--graphs 20] [--seed 0] [--out results/tutoring] [-- SETTINGS]
+    python scripts/results/tutoring.py [PART ...] [--graphs 20] [--seed 0] [--out results/tutoring] [-- SETTINGS]
 
-Every tutor teaches the same students on the same graphs, by `star train tutoring/NAME` with SETTINGS. Written are
-tutors.json (lasting levels of each graph, and their curves), discovery.json (precision, recall and AUC of each graph
-and of all pairs together), table.md with 95 % intervals over graphs and whether each claim holds, and levels.png.
+PART is one of these, by default both:
+
+    tutors      every tutor teaches the same students on the same graphs, by `star train tutoring/NAME` with SETTINGS:
+                tutors.json (lasting levels of each graph, and their curves), levels.png, and of knowledge tracing
+                discovery.json (precision, recall and AUC of each graph and of all edges together)
+    withheld    the withheld-skill test on the same graphs: withheld.json, like discovery.json
+
+table.md is made of all of these files, with 95 % intervals over graphs and whether each claim holds.
 """
 
 from __future__ import annotations
@@ -15,6 +20,7 @@ import platform
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +31,12 @@ from matplotlib.figure import Figure
 from star.cli.words import split_settings
 from star.config.loading import load
 from star.report.statistics import mean_interval
+from star.training import program as programs
 from star.training import trainer
 from star.training.journal import Journal
+from star.tutoring import graphs as matrices
+from star.tutoring import withheld
+from star.tutoring.experiment import withheld_scores
 
 TUTORS = {
     "random": ("random", {}),
@@ -69,10 +79,50 @@ def discovered(found: dict[str, Any]) -> dict[str, Any]:
     """Quality of the graphs that a tutor found, each and all of their edges together."""
     tables = found.pop("tables")
     true, known = ([{tuple(edge[:2]) for edge in row[key]} for row in tables] for key in ("prerequisites", "found"))
-    hits = [len(a & b) for a, b in zip(true, known, strict=True)]
-    counts = {"found": list(map(len, known)), "true": list(map(len, true)), "right": hits}
-    pooled = {"precision": sum(hits) / sum(counts["found"]), "recall": sum(hits) / sum(counts["true"])}
-    return {"each": found.pop("graphs"), "edges": counts, "pooled": pooled}
+    edges = counted(true, known)
+    return {"each": found.pop("graphs"), "edges": edges, "pooled": pooled(edges)}
+
+
+def counted(true: Sequence[set[Any]], found: Sequence[set[Any]]) -> dict[str, list[int]]:
+    """Numbers of edges of each graph."""
+    hits = [len(a & b) for a, b in zip(true, found, strict=True)]
+    return {"found": list(map(len, found)), "true": list(map(len, true)), "right": hits}
+
+
+def pooled(edges: Mapping[str, Sequence[int]]) -> dict[str, float]:
+    """Precision and recall of the edges of all graphs together."""
+    right = sum(edges["right"])
+    return {"precision": right / sum(edges["found"]), "recall": right / sum(edges["true"])}
+
+
+def tested(settings: dict[str, Any], *, seed: int, graphs: int) -> dict[str, Any]:
+    """Quality of the graphs that the withheld-skill test finds.
+
+    Students choose evenly but for the skill withheld: preferences are of use to knowledge tracing alone.
+    """
+    began = time.monotonic()
+    own = {"trainer.seed": seed, "trainer.num_seeds": graphs, "discovery.preference": 0.0} | settings
+    config = load("tutoring/random", own)
+    program = programs.build(config)
+    courses = program.init(program.seed_keys()).course
+    work = jax.jit(jax.vmap(lambda course, key: withheld_scores(config, course, key=key)))
+    rows = jax.device_get((courses, *work(courses, program.evaluation_keys(0))))
+    each: dict[str, list[float]] = {"precision": [], "recall": [], "auc": []}
+    edges, pairs = [], []
+    for i in range(graphs):
+        course, lot, scores = jax.tree.map(lambda x, i=i: x[i], rows)
+        effects = withheld.discover(course.needs, scores, lot)
+        for key, value in matrices.quality(course.parents, effects.parents, effects.drop).items():
+            each[key].append(float(value))
+        edges.append([_edges(course.parents), _edges(effects.parents)])
+        pairs.append([_edges(matrices.ancestors(course.parents)), _edges(effects.pairs)])
+    found = counted(*zip(*edges, strict=True))
+    about = {"settings": own, "rate": withheld.RATE, "seconds": round(time.monotonic() - began, 1)}
+    return about | {"each": each, "edges": found, "pooled": pooled(found), "pairs": counted(*zip(*pairs, strict=True))}
+
+
+def _edges(graph: Any) -> set[tuple[int, int]]:
+    return set(map(tuple, np.argwhere(graph).tolist()))
 
 
 def claims(level: dict[str, np.ndarray], graphs: dict[str, Any]) -> list[tuple[str, str, bool]]:
@@ -116,8 +166,8 @@ def _interval(values: np.ndarray, shape: str) -> str:
     return f"{values.mean():{shape}} [{low:{shape}}, {high:{shape}}]"
 
 
-def table(tutors: list[dict[str, Any]], graphs: dict[str, Any]) -> str:
-    """Markdown: tutors, then claims."""
+def table(tutors: list[dict[str, Any]], graphs: dict[str, Any], test: dict[str, Any]) -> str:
+    """Markdown: tutors, claims, and both ways to find a graph: by knowledge tracing and by the withheld-skill test."""
     level = {one["tutor"]: np.asarray(one["level"]) for one in tutors}
     lines = [
         "| tutor | level at the end | level, mean over time | skills mastered | seconds |",
@@ -139,8 +189,29 @@ def table(tutors: list[dict[str, Any]], graphs: dict[str, Any]) -> str:
     lines += [
         "",
         f"Of the {found} edges found in all graphs {right} are right; {right} of the {true} true ones are found.",
+        "",
+        *_ways(graphs, test),
     ]
     return "\n".join([*lines, ""])
+
+
+def _ways(tracing: dict[str, Any], test: dict[str, Any]) -> list[str]:
+    lines = ["| of the graph found | knowledge tracing | withheld-skill test | difference |", "|---|---|---|---|"]
+    for key in ("precision", "recall", "auc"):
+        one, other = (np.asarray(way["each"][key], float) for way in (tracing, test))
+        lines.append(
+            f"| {key} | {_interval(one, '.2f')} | {_interval(other, '.2f')} | {_interval(other - one, '+.2f')} |"
+        )
+    cells = [f"{sum(way['edges']['found'])}, {sum(way['edges']['right'])}" for way in (tracing, test)]
+    found, right, true = (sum(test["pairs"][key]) for key in ("found", "right", "true"))
+    return [
+        *lines,
+        f"| edges of all graphs, and right ones | {' | '.join(cells)} | |",
+        "",
+        f"The test found {found} pairs. In {right} of them one skill comes before the other, directly or not. "
+        f"There are {true} such pairs. {(found - right) / found:.2f} of what it found is wrong; "
+        f"its false discovery rate is set to {test['rate']:.2f}.",
+    ]
 
 
 def draw(tutors: list[dict[str, Any]], path: Path) -> None:
@@ -157,29 +228,51 @@ def draw(tutors: list[dict[str, Any]], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main() -> None:
-    """Teach, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--graphs", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("results/tutoring"))
-    words, settings = split_settings(sys.argv[1:])
-    options = parser.parse_args([word for word in words if word != "--"])
+def teach(settings: dict[str, Any], options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """The part of the tutors: what each of its files holds."""
     tutors: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         for name in TUTORS:
             tutors.append(taught(name, settings, Path(folder), seed=options.seed, graphs=options.graphs))
             print(f"{name}: {_interval(np.asarray(tutors[-1]['level']), '.0f')}, {tutors[-1]['seconds']} s", flush=True)
     found = {one["tutor"]: discovered(one) for one in tutors if "tables" in one}
-    graphs = found["sgim_graph, graph found"]
+    draw(tutors, options.out / "levels.png")
+    return {"tutors": {"tutors": tutors}, "discovery": found["sgim_graph, graph found"]}
+
+
+def withhold(settings: dict[str, Any], options: argparse.Namespace) -> dict[str, dict[str, Any]]:
+    """The part of the withheld-skill test."""
+    return {"withheld": tested(settings, seed=options.seed, graphs=options.graphs)}
+
+
+PARTS: Mapping[str, Callable[..., dict[str, dict[str, Any]]]] = {"tutors": teach, "withheld": withhold}
+
+
+def main() -> None:
+    """Teach, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--graphs", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("results/tutoring"))
+    words, settings = split_settings(sys.argv[1:])
+    options = parser.parse_args([word for word in words if word != "--"])
+    for part in options.parts:
+        if part not in PARTS:
+            parser.error(f"{part!r} is not allowed: should be {' or '.join(PARTS)}")
     options.out.mkdir(parents=True, exist_ok=True)
     about = {"graphs": options.graphs, "seed": options.seed, "command": " ".join(["python", *sys.argv])}
     about |= {"device": jax.default_backend(), "python": platform.python_version(), "jax": jax.__version__}
-    for name, content in (("tutors", {"tutors": tutors}), ("discovery", graphs)):
-        (options.out / f"{name}.json").write_text(json.dumps(about | content) + "\n", encoding="utf-8")
-    (options.out / "table.md").write_text(table(tutors, graphs), encoding="utf-8")
-    draw(tutors, options.out / "levels.png")
-    print(table(tutors, graphs))
+    for part in options.parts or PARTS:
+        for name, content in PARTS[part](settings, options).items():
+            (options.out / f"{name}.json").write_text(json.dumps(about | content) + "\n", encoding="utf-8")
+    files = [options.out / f"{name}.json" for name in ("tutors", "discovery", "withheld")]
+    for missing in (file for file in files if not file.is_file()):
+        parser.error(f"{missing}: no such file, so no table is made: run the other part, too")
+    tutors, graphs, test = (json.loads(file.read_text(encoding="utf-8")) for file in files)
+    made = table(tutors["tutors"], graphs, test)
+    (options.out / "table.md").write_text(made, encoding="utf-8")
+    print(made)
 
 
 if __name__ == "__main__":
