@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from scripts.pages import charts
-from scripts.results import digest, page
+from scripts.results import digest, page, tutoring
 
 ROOT = Path(__file__).parents[1]
 RENEW = "run `python scripts/results/page.py`"
@@ -36,6 +36,14 @@ def test_the_charts_keep_step_with_the_json_files(rows):
     assert {charts.shown(name) for name in re.findall(r"images/(results_\w+)\.png", page.page(rows))} == {of}, RENEW
     other = dict(rows) | {"ant_fall/gara": rows["ant_fall/star"]}
     assert page.sources(other) != of
+
+
+def test_the_tables_of_the_tutor_keep_step_with_the_json_files():
+    results, text = ROOT / "results" / "tutoring", (ROOT / "docs" / "tutoring.md").read_text(encoding="utf-8")
+    made = tutoring.table(*(json.loads((results / f"{name}.json").read_text("utf-8")) for name in tutoring.FILES))
+    assert (results / "table.md").read_text(encoding="utf-8") == made, "run `python scripts/results/tutoring.py`"
+    missing = [block for block in made.strip().split("\n\n") if block not in text]
+    assert not missing, "docs/tutoring.md has other tables than results/tutoring/table.md"
 
 
 def report(success, *, digests=(), seconds=12.0):

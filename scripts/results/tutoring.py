@@ -7,7 +7,8 @@ PART is one of these, by default both:
     tutors      every tutor teaches the same students on the same graphs, by `star train tutoring/NAME` with SETTINGS:
                 tutors.json (lasting levels of each graph, and their curves), levels.png, and of knowledge tracing
                 discovery.json (precision, recall and AUC of each graph and of all edges together)
-    withheld    the withheld-skill test on the same graphs: withheld.json, like discovery.json
+    withheld    the withheld-skill test on the same graphs: withheld.json, like discovery.json, and withheld_apart.json,
+                where each exercise needs one skill alone
 
 table.md is made of all of these files, with 95 % intervals over graphs and whether each claim holds.
 """
@@ -108,17 +109,21 @@ def tested(settings: dict[str, Any], *, seed: int, graphs: int) -> dict[str, Any
     work = jax.jit(jax.vmap(lambda course, key: withheld_scores(config, course, key=key)))
     rows = jax.device_get((courses, *work(courses, program.evaluation_keys(0))))
     each: dict[str, list[float]] = {"precision": [], "recall": [], "auc": []}
-    edges, pairs = [], []
+    edges, pairs, together = [], [], []
     for i in range(graphs):
         course, lot, scores = jax.tree.map(lambda x, i=i: x[i], rows)
         effects = withheld.discover(course.needs, scores, lot)
         for key, value in matrices.quality(course.parents, effects.parents, effects.drop).items():
             each[key].append(float(value))
+        above = np.asarray(matrices.ancestors(course.parents))
         edges.append([_edges(course.parents), _edges(effects.parents)])
-        pairs.append([_edges(matrices.ancestors(course.parents)), _edges(effects.pairs)])
+        pairs.append([_edges(above), _edges(effects.pairs)])
+        common = course.needs.T.astype(int) @ course.needs > 0
+        together.append(int((effects.pairs & ~above & common).sum()))
     found = counted(*zip(*edges, strict=True))
     about = {"settings": own, "rate": withheld.RATE, "seconds": round(time.monotonic() - began, 1)}
-    return about | {"each": each, "edges": found, "pooled": pooled(found), "pairs": counted(*zip(*pairs, strict=True))}
+    about |= {"each": each, "edges": found, "pooled": pooled(found)}
+    return about | {"pairs": counted(*zip(*pairs, strict=True)) | {"wrong_with_common_exercise": together}}
 
 
 def _edges(graph: Any) -> set[tuple[int, int]]:
@@ -166,14 +171,14 @@ def _interval(values: np.ndarray, shape: str) -> str:
     return f"{values.mean():{shape}} [{low:{shape}}, {high:{shape}}]"
 
 
-def table(tutors: list[dict[str, Any]], graphs: dict[str, Any], test: dict[str, Any]) -> str:
-    """Markdown: tutors, claims, and both ways to find a graph: by knowledge tracing and by the withheld-skill test."""
-    level = {one["tutor"]: np.asarray(one["level"]) for one in tutors}
+def table(tutors: dict[str, Any], discovery: dict[str, Any], test: dict[str, Any], apart: dict[str, Any]) -> str:
+    """Markdown, of the content of the JSON `FILES`: tutors, claims, two ways to find a graph, and pairs of skills."""
+    level = {one["tutor"]: np.asarray(one["level"]) for one in tutors["tutors"]}
     lines = [
         "| tutor | level at the end | level, mean over time | skills mastered | seconds |",
         "|---|---|---|---|---|",
     ]
-    for one in tutors:
+    for one in tutors["tutors"]:
         course = np.mean(list(one["curve"].values()), axis=0)
         cells = (
             _interval(level[one["tutor"]], ".0f"),
@@ -183,14 +188,16 @@ def table(tutors: list[dict[str, Any]], graphs: dict[str, Any], test: dict[str, 
         lines.append(f"| {one['tutor']} | {' | '.join(cells)} | {one['seconds']:.0f} |")
     lines += ["", "| to be shown | found | |", "|---|---|---|"]
     lines += [
-        f"| {what} | {found} | {'holds' if holds else '**fails**'} |" for what, found, holds in claims(level, graphs)
+        f"| {what} | {found} | {'holds' if holds else '**fails**'} |" for what, found, holds in claims(level, discovery)
     ]
-    right, found, true = (sum(graphs["edges"][key]) for key in ("right", "found", "true"))
+    right, found, true = (sum(discovery["edges"][key]) for key in ("right", "found", "true"))
     lines += [
         "",
         f"Of the {found} edges found in all graphs {right} are right; {right} of the {true} true ones are found.",
         "",
-        *_ways(graphs, test),
+        *_ways(discovery, test),
+        "",
+        *_pairs(test, apart),
     ]
     return "\n".join([*lines, ""])
 
@@ -203,15 +210,22 @@ def _ways(tracing: dict[str, Any], test: dict[str, Any]) -> list[str]:
             f"| {key} | {_interval(one, '.2f')} | {_interval(other, '.2f')} | {_interval(other - one, '+.2f')} |"
         )
     cells = [f"{sum(way['edges']['found'])}, {sum(way['edges']['right'])}" for way in (tracing, test)]
-    found, right, true = (sum(test["pairs"][key]) for key in ("found", "right", "true"))
-    return [
-        *lines,
-        f"| edges of all graphs, and right ones | {' | '.join(cells)} | |",
-        "",
-        f"The test found {found} pairs. In {right} of them one skill comes before the other, directly or not. "
-        f"There are {true} such pairs. {(found - right) / found:.2f} of what it found is wrong; "
-        f"its false discovery rate is set to {test['rate']:.2f}.",
-    ]
+    return [*lines, f"| edges of all graphs, and right ones | {' | '.join(cells)} | |"]
+
+
+def _pairs(test: dict[str, Any], apart: dict[str, Any]) -> list[str]:
+    """The pairs that the test found; the graph is made of them."""
+    both = test, apart
+    lines = ["| pairs of skills | exercises as above | one skill for each exercise |", "|---|---|---|"]
+    for text, key in (
+        ("one comes before the other", "true"),
+        ("found", "found"),
+        ("right", "right"),
+        ("wrong, and some exercise needs both skills", "wrong_with_common_exercise"),
+    ):
+        lines.append(f"| {text} | {' | '.join(str(sum(one['pairs'][key])) for one in both)} |")
+    wrong = [1 - sum(one["pairs"]["right"]) / sum(one["pairs"]["found"]) for one in both]
+    return [*lines, f"| share of wrong ones, {test['rate']} asked for | {' | '.join(f'{x:.2f}' for x in wrong)} |"]
 
 
 def draw(tutors: list[dict[str, Any]], path: Path) -> None:
@@ -242,9 +256,11 @@ def teach(settings: dict[str, Any], options: argparse.Namespace) -> dict[str, di
 
 def withhold(settings: dict[str, Any], options: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """The part of the withheld-skill test."""
-    return {"withheld": tested(settings, seed=options.seed, graphs=options.graphs)}
+    kinds: dict[str, dict[str, Any]] = {"withheld": {}, "withheld_apart": {"course.needs": 0}}
+    return {name: tested(settings | own, seed=options.seed, graphs=options.graphs) for name, own in kinds.items()}
 
 
+FILES = ("tutors", "discovery", "withheld", "withheld_apart")
 PARTS: Mapping[str, Callable[..., dict[str, dict[str, Any]]]] = {"tutors": teach, "withheld": withhold}
 
 
@@ -266,11 +282,12 @@ def main() -> None:
     for part in options.parts or PARTS:
         for name, content in PARTS[part](settings, options).items():
             (options.out / f"{name}.json").write_text(json.dumps(about | content) + "\n", encoding="utf-8")
-    files = [options.out / f"{name}.json" for name in ("tutors", "discovery", "withheld")]
-    for missing in (file for file in files if not file.is_file()):
-        parser.error(f"{missing}: no such file, so no table is made: run the other part, too")
-    tutors, graphs, test = (json.loads(file.read_text(encoding="utf-8")) for file in files)
-    made = table(tutors["tutors"], graphs, test)
+    files = [options.out / f"{name}.json" for name in FILES]
+    missing = [str(file) for file in files if not file.is_file()]
+    if missing:
+        print(f"no table is made without {', '.join(missing)}")
+        return
+    made = table(*(json.loads(file.read_text(encoding="utf-8")) for file in files))
     (options.out / "table.md").write_text(made, encoding="utf-8")
     print(made)
 

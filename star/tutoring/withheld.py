@@ -11,8 +11,8 @@ A skill is a prerequisite of another, near or far, if students without it succee
 
 Least squares share a score out among the skills of its exercise, so that none is blamed for what another lacks.
 
-The skill that a student does without must be drawn by lot. Where it is not, students differ in more than the skill:
-weak ones never come to hard skills, so a hard skill would look like a prerequisite of easy ones.
+The skill that a student does without must be drawn by lot. Groups that are not differ in more than the skill: weak
+students never come to hard skills, so that a hard skill would look like a prerequisite of easy ones.
 
 Sources: Welch, Biometrika 1947; Benjamini and Hochberg, JRSS B 1995. Both the experiment and the estimate of success
 are ours.
@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy import stats
@@ -36,7 +36,7 @@ RATE = 0.05
 
 
 class Effects(NamedTuple):
-    """What it does to success in skill i to withhold skill j: [i, j]."""
+    """The effects on success in skill i of withholding skill j: [i, j]."""
 
     parents: Bool[np.ndarray, "n n"]
     """j is a prerequisite of i; without cycles and edges that others imply."""
@@ -65,12 +65,15 @@ def discover(
     success, practised = successes(needs, *totals(scores, len(withheld), len(needs)))
     drop, p = drops(success, practised, withheld)
     pairs = significant(p, rate)
-    parents = graphs.acyclic(jnp.asarray(np.where(pairs, drop, 0.0)), 0.0)
+    parents = _acyclic(np.where(pairs, drop, 0.0), 0.0)
     return Effects(np.asarray(parents), pairs, drop, p)
 
 
+_acyclic = jax.jit(graphs.acyclic)
+
+
 def totals(scores: Scores, students: int, exercises: int) -> tuple[Int[np.ndarray, "P E"], Int[np.ndarray, "P E"]]:
-    """How many scores each student has of each exercise, and how many of them are right, in the later half of them."""
+    """Numbers of scores and of right ones that each student has in each exercise, of the later half of its scores."""
     student, exercise, right = (np.asarray(column) for column in (scores.student, scores.exercise, scores.right))
     order = np.argsort(student, kind="stable")
     number = np.bincount(student, minlength=students)

@@ -63,3 +63,37 @@ def features(needs, rows, rates):
         counts = [[math.log(1 + x) for x in count] for count in (right, wrong)]
         found.append(counts + [[4 * x for x in one] for one in running])
     return found
+
+
+def step_up(p, rate):
+    """Which of m p-values Benjamini and Hochberg reject: the k smallest, for the largest k with p_(k) <= rate k / m."""
+    order = sorted(range(len(p)), key=lambda i: p[i])
+    most = max([k for k in range(1, len(p) + 1) if p[order[k - 1]] <= rate * k / len(p)], default=0)
+    return [order.index(i) < most for i in range(len(p))]
+
+
+def successes(needs, rows, students):
+    """Of each student {skill: success above the mean}, by gradient descent, from rows (student, exercise, right)."""
+    later = []
+    for student in range(students):
+        own = [row for row in rows if row[0] == student]
+        later += own[(len(own) + 1) // 2 :]
+    mean = {e: np.mean([r for _, f, r in later if f == e]) for e in {e for _, e, _ in later}}
+    found = []
+    for student in range(students):
+        own = [(np.flatnonzero(needs[e]), right - mean[e]) for who, e, right in later if who == student]
+        value = np.zeros(len(needs[0]))
+        for _ in range(400):
+            slope = value.copy()
+            for needed, above in own:
+                slope[needed] += value[needed].sum() - above
+            value -= 0.05 * slope
+        found.append({k: value[k] for needed, _ in own for k in needed})
+    return found
+
+
+def welch(lower, higher):
+    """(difference of means, t, degrees of freedom) of two samples."""
+    (a, b), (v, w) = ([f(x) for x in (lower, higher)] for f in (np.mean, lambda x: np.var(x, ddof=1) / len(x)))
+    freedom = (v + w) ** 2 / (v**2 / (len(lower) - 1) + w**2 / (len(higher) - 1))
+    return b - a, (b - a) / math.sqrt(v + w), freedom
