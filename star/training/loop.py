@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -172,8 +173,10 @@ class Loop:
                     self._display.note(f"seed {seed}: {line}")
 
     def _compute(self, state: Any) -> tuple[Any, list[dict[str, Any]]]:
-        state, metrics = self._program.epoch(state)
-        return state, of_epoch(metrics, self._program.seeds)
+        compiles = self._done == self._began and jax.process_count() == 1  # several would have to compile in one order
+        with self._program.evaluation_compiling() if compiles else nullcontext():
+            state, metrics = self._program.epoch(state)
+            return state, of_epoch(metrics, self._program.seeds)
 
     def _evaluate(self, state: Any) -> Any:
         return jax.block_until_ready(self._program.evaluate(state, self._program.evaluation_keys(self._done)))

@@ -135,7 +135,7 @@ def test_confidence_agrees_with_a_slow_computation(n):
 def test_a_teacher_shows_what_he_can_where_most_goals_are_out_of_reach():
     far = dataclasses.replace(TASKS[0], lower=(-40.0, -40.0), upper=(40.0, 40.0))
     world = dataclasses.replace(WORLD, tasks=(far,), simulate=lambda s, n: (worlds.outcomes((2 * s[0], True)), s))
-    demos = teachers.demonstrated(world, 0, 5, scale_of(world))  # of 320 goals one is within 2
+    demos = teachers.demonstrated(world, [0], 5, scale_of(world))[0]  # of 320 goals one is within 2
     assert len(demos.lengths) == 5 and np.abs(demos.outcomes).max() <= 2
     np.testing.assert_allclose(demos.outcomes[:, :2], 2 * demos.sequences[:, 0], atol=1e-6)
 
