@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
+from importlib import import_module
 from typing import Any
 
 import jax
@@ -70,12 +71,16 @@ class Program:
         return self.functions.evaluate(self.hyper, state, keys)
 
     @contextmanager
-    def evaluation_compiling(self) -> Iterator[None]:
-        """What is done inside goes on while the evaluation compiles; one that cannot says so when it is called."""
+    def preparing(self) -> Iterator[None]:
+        """What is done inside goes on while the evaluation compiles and what draws figures is imported.
+
+        What cannot be prepared says so when it is used.
+        """
         evaluate = self.functions.evaluate
         with ThreadPoolExecutor(max_workers=1) as pool:
             if isinstance(evaluate, jax.stages.Wrapped):
                 pool.submit(lambda: evaluate.lower(self.hyper, self.example(), self.evaluation_keys(0)).compile())
+            pool.submit(import_module, "matplotlib.figure")
             yield
 
     def rows(self, evaluated: Any) -> list[dict[str, Any]]:

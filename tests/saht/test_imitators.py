@@ -140,6 +140,15 @@ def test_a_teacher_shows_what_he_can_where_most_goals_are_out_of_reach():
     np.testing.assert_allclose(demos.outcomes[:, :2], 2 * demos.sequences[:, 0], atol=1e-6)
 
 
+def test_what_a_teacher_shows_does_not_depend_on_who_else_is_asked():
+    scale = scale_of(WORLD)
+    together = teachers.demonstrated(WORLD, [0, 1], 5, scale)
+    for task, demos in together.items():
+        (alone,) = teachers.demonstrated(WORLD, [task], 5, scale).values()
+        jax.tree.map(np.testing.assert_array_equal, demos, alone)
+    assert not np.array_equal(together[0].sequences, together[1].sequences)
+
+
 def test_a_world_in_which_nobody_shows_a_task_has_no_such_learners():
     silent = dataclasses.replace(WORLD, tasks=(TASKS[0], dataclasses.replace(TASKS[1], demonstrate=None)))
     with pytest.raises(worlds.world.EnvError, match="nobody demonstrates once in twice"):
