@@ -179,10 +179,8 @@ def _tried(
 
     The programs of all tasks, and that which executes, compile side by side.
     """
-    numbers = jax.vmap(modes.key)(np.asarray(tasks, np.uint32))
-    if turn > 0:
-        numbers = jax.vmap(jax.random.fold_in, in_axes=(0, None))(numbers, turn)
-    keys, goals = jax.device_get(_drawn(numbers, *(bound[list(tasks)] for bound in (world.lower, world.upper)), count))
+    drawn = [_drawn(np.uint32(task), turn, world.lower[task], world.upper[task], count) for task in tasks]
+    keys, goals = zip(*jax.device_get(drawn), strict=True)
     still = jnp.asarray(np.zeros((count, world.longest, world.primitive), np.float32))
     once = jnp.asarray(np.ones(count, np.int32))
     with ThreadPoolExecutor() as pool:
@@ -198,12 +196,12 @@ def _tried(
     return tried
 
 
-@partial(jax.jit, static_argnums=3)
-def _drawn(keys: Array, lower: Array, upper: Array, count: int) -> tuple[list[Array], list[Array]]:
-    """Each of N keys, and goals [count, 4] drawn with it evenly between bounds [N, 4]."""
-    draw = partial(jax.random.uniform, shape=(count, 4))
-    goals = jax.vmap(lambda key, low, high: draw(key, minval=low, maxval=high))(keys, lower, upper)
-    return list(keys), list(goals)
+@partial(jax.jit, static_argnums=4)
+def _drawn(task: Array, turn: Array, lower: Array, upper: Array, count: int) -> tuple[Array, Array]:
+    """A key, and goals [count, 4] drawn evenly between bounds [4] with it."""
+    first = modes.key(task)
+    key = jnp.where(turn == 0, first, jax.random.fold_in(first, turn))
+    return key, jax.random.uniform(key, (count, 4), minval=lower, maxval=upper)
 
 
 @jax.jit

@@ -72,9 +72,9 @@ class Program:
 
     @contextmanager
     def preparing(self) -> Iterator[None]:
-        """What is done inside goes on while the evaluation compiles and what draws figures is imported.
+        """The evaluation compiles in a thread, and Matplotlib is imported there, while the body goes on.
 
-        What cannot be prepared says so when it is used.
+        Errors of either are left to its first use.
         """
         evaluate = self.functions.evaluate
         with ThreadPoolExecutor(max_workers=1) as pool:
