@@ -99,14 +99,14 @@ class World:
         return tuple(len(task.lower) for task in self.tasks)
 
     @property
-    def lower(self) -> Float[Array, "S 4"]:
+    def lower(self) -> Float[np.ndarray, "S 4"]:
         """Lower bounds of outcomes and goals; 0 after a task's own dimensions."""
-        return jnp.stack([_padded(task.lower) for task in self.tasks])
+        return np.concatenate([_widened([task.lower]) for task in self.tasks])
 
     @property
-    def upper(self) -> Float[Array, "S 4"]:
+    def upper(self) -> Float[np.ndarray, "S 4"]:
         """Upper bounds of outcomes and goals; 0 after a task's own dimensions."""
-        return jnp.stack([_padded(task.upper) for task in self.tasks])
+        return np.concatenate([_widened([task.upper]) for task in self.tasks])
 
     def index(self, task: int | str) -> int:
         """The number of a task, given by its name or itself.
@@ -135,10 +135,9 @@ class World:
         """As `execute`, and the path at every control step. After the last primitive the path stays where it is."""
         return _trace(self, *self._checked(sequence, length, key))
 
-    def benchmark(self, task: int | str) -> Float[Array, "n 4"]:
+    def benchmark(self, task: int | str) -> Float[np.ndarray, "n 4"]:
         """The goals of the evaluation of a task, never to be practised; the same every time."""
-        goals = np.asarray(self.tasks[self.index(task)].goals(), np.float32)
-        return jnp.pad(goals, ((0, 0), (0, WIDTH - goals.shape[1])))
+        return _widened(self.tasks[self.index(task)].goals())
 
     def demonstrate(self, task: int | str, goal: Array) -> tuple[Float[Array, "*batch L p"], Int[Array, "*batch"]]:
         """A sequence, and its length, that reaches `goal` [*batch, 4] of a task.
@@ -242,6 +241,12 @@ def _padded(values: Any) -> Float[Array, "4"]:
     """`values` [d] and then 0."""
     values = jnp.asarray(values, jnp.float32)
     return jnp.pad(values, (0, WIDTH - values.shape[-1]))
+
+
+def _widened(points: Any) -> Float[np.ndarray, "n 4"]:
+    """`points` [n, d], each and then 0, on the host: nothing is compiled for them."""
+    points = np.asarray(points, np.float32)
+    return np.pad(points, ((0, 0), (0, WIDTH - points.shape[1])))
 
 
 def _listed(shape: Any) -> str:

@@ -20,6 +20,8 @@ from star.saht.proposals import Setting, Way
 from star.saht.sections import Config, Learner
 from star.saht.teachers import Shown
 from star.sgim import selection
+from star.sgim.sections import SelectionConfig
+from star.sgim.selection import SgimState
 from star.training.experiment import Experiment, numbers, over_seeds
 from star.training.journal import mean
 
@@ -161,16 +163,12 @@ class Saht(Experiment):
 
     def tables(self, hyper: Learner, state: State, seeds: Sequence[int]) -> list[dict[str, Any]]:
         """Regions of goals with their interest, and all that is counted."""
-        section = hyper.saht.choice.selection
-        goals, tallies = jax.device_get((state.tables.goals, state.tallies))
+        described = _described(hyper.saht.choice.selection, state.tables.goals)
+        (active, regions), tallies = jax.device_get((described, vars(state.tallies)))
         found = []
         for i in range(len(seeds)):
-            one = jax.tree.map(lambda leaf, i=i: leaf[i], goals)
-            used = np.flatnonzero(one.abstraction.active)
-            worth = np.asarray(selection.interest(section, one))[used, 0]
-            boxes = {name: getattr(one.abstraction, name)[used].tolist() for name in ("lower", "upper")}
-            counts = {name: leaf[i].tolist() for name, leaf in vars(tallies).items()}
-            found.append(boxes | {"interest": worth.tolist()} | counts)
+            boxes = {name: regions[name][i, active[i]].tolist() for name in ("lower", "upper", "interest")}
+            found.append(boxes | {name: leaf[i].tolist() for name, leaf in tallies.items()})
         return found
 
     def figures(self, rows: Sequence[Mapping[str, Any]], tables: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
@@ -188,6 +186,18 @@ class Saht(Experiment):
             asked = sum(mean(rows, f"saht/strategy_{one.name}") or 0.0 for one in taught)
             found["asks"] = f"a teacher in {asked:.2f} of the blocks"
         return found
+
+
+@jax.jit
+def _described(section: SelectionConfig, goals: SgimState) -> tuple[Bool[Array, "seeds R"], dict[str, Array]]:
+    """The regions of goals in use, and their bounds and interest, of all seeds."""
+
+    def one(goals: SgimState) -> tuple[Array, dict[str, Array]]:
+        where = goals.abstraction
+        worth = selection.interest(section, goals)[:, 0]
+        return where.active, {"lower": where.lower, "upper": where.upper, "interest": worth}
+
+    return jax.vmap(one)(goals)
 
 
 def ways(config: Config, world: worlds.World) -> tuple[Way, ...]:

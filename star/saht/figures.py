@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
@@ -154,6 +155,7 @@ def hierarchy(world: World, last: Sequence[Row]) -> Figure:
     pairs = np.mean([row["pairs"] for row in last], axis=0)[:_MOST_MATRICES]
     share = pairs / np.maximum(pairs.sum(axis=(1, 2), keepdims=True), 1)
     n = len(world.tasks)
+    designed = jax.device_get(jax.jit(lambda: [world.decompose(task, jnp.zeros(4)) for task in range(n)])())
     figure = Figure(figsize=(2.1 * len(share) + 1.4, 3.1), layout="constrained")
     panels = figure.subplots(1, len(share), squeeze=False, sharey=True)[0]
     for task, axes in enumerate(panels):
@@ -161,9 +163,8 @@ def hierarchy(world: World, last: Sequence[Row]) -> Figure:
         axes.set_title(literal(world.names[task]), size=9)
         axes.set_xticks(range(n), [literal(name) for name in world.names], rotation=90, size=7)
         axes.set_yticks(range(n), [literal(name) for name in world.names], size=7)
-        designed = world.decompose(task, jnp.zeros(4))
-        if bool(designed.exists):
-            first, second = np.asarray(designed.tasks)
+        if designed[task].exists:
+            first, second = designed[task].tasks
             axes.add_patch(Rectangle((second - 0.5, first - 0.5), 1, 1, fill=False, edgecolor="#ee6677", lw=2))
     panels[0].set_ylabel("first", size=8)
     figure.supxlabel("second", size=8)

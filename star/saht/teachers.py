@@ -16,7 +16,9 @@ The last two are there together or not at all. With them a file shows procedures
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -102,27 +104,32 @@ def expanded(teachers: Sequence[TeacherConfig], world: World) -> tuple[TeacherCo
 
 def shown_by(teachers: Sequence[TeacherConfig], world: World, scale: Scale) -> Shown:
     """Their demonstrations, scaled; raises `UserError` in one line if a file is wrong."""
-    all_shown = [_demonstrations(teacher, world, scale) for teacher in teachers]
-    most = max((len(demos.lengths) for demos in all_shown), default=1)
-
-    def stacked(leaves: Sequence[np.ndarray]) -> Array:
-        return jnp.stack([jnp.asarray(np.resize(leaf, (most, *leaf.shape[1:]))) for leaf in leaves])
-
-    if not all_shown:
-        all_shown = [_nothing(world)]
-    sequences, lengths, outcomes, pairs, subgoals = (stacked(leaves) for leaves in zip(*all_shown, strict=True))
     tasks = np.array([world.index(teacher.task or 0) for teacher in teachers] or [0])
-    outcomes = (outcomes - scale.lower[tasks, None]) / scale.width[tasks, None]
-    subgoals = (subgoals - jnp.asarray(scale.lower)[pairs]) / jnp.asarray(scale.width)[pairs]
-    counts = jnp.array([len(demos.lengths) for demos in all_shown])
-    return Shown(sequences, lengths, outcomes, pairs, subgoals, counts)
+    asked: dict[int, set[int]] = {}  # the tasks that the world's own teachers show so many times
+    for teacher, task in zip(teachers, tasks.tolist(), strict=False):
+        if teacher.source == "world" and teacher.kind != "procedure":
+            asked.setdefault(teacher.demos, set()).add(task)
+    own = {count: demonstrated(world, sorted(those), count, scale) for count, those in asked.items()}
+    all_shown = [_demonstrations(teacher, world, own) for teacher in teachers] or [_nothing(world)]
+    most = max(len(demos.lengths) for demos in all_shown)
+    sequences, lengths, outcomes, pairs, subgoals = (
+        np.stack([np.resize(leaf, (most, *leaf.shape[1:])) for leaf in leaves])
+        for leaves in zip(*all_shown, strict=True)
+    )
+    outcomes = _scaled(outcomes, scale.lower[tasks, None], scale.width[tasks, None])
+    subgoals = _scaled(subgoals, scale.lower[pairs], scale.width[pairs])
+    counts = np.array([len(demos.lengths) for demos in all_shown])
+    return Shown(*map(jnp.asarray, (sequences, lengths, outcomes, pairs, subgoals, counts)))
 
 
-def _demonstrations(teacher: TeacherConfig, world: World, scale: Scale) -> Demonstrations:
+def _demonstrations(
+    teacher: TeacherConfig, world: World, own: Mapping[int, Mapping[int, Demonstrations]]
+) -> Demonstrations:
+    """Those of a teacher; `own` are the world's, by their count and task."""
     if teacher.source == "world":
         if teacher.kind == "procedure":
             return _nothing(world)
-        demos = demonstrated(world, world.index(teacher.task or 0), teacher.demos, scale)
+        demos = own[teacher.demos][world.index(teacher.task or 0)]
     else:
         demos = load(Path(teacher.source), world, teacher.task or "", sha256=teacher.sha256)
     if teacher.kind == "procedure":
@@ -142,31 +149,64 @@ def _nothing(world: World) -> Demonstrations:
     return Demonstrations.plain(sequences, np.ones(1, np.int32), np.zeros((1, 4), np.float32))
 
 
-def demonstrated(world: World, task: int, count: int, scale: Scale) -> Demonstrations:
-    """Demonstrations of the world's own teacher without noise: goals drawn evenly, of which reached ones count.
+def demonstrated(world: World, tasks: Sequence[int], count: int, scale: Scale) -> dict[int, Demonstrations]:
+    """Demonstrations of each task by the world's own teacher: goals drawn evenly, of which reached ones count.
 
     Raises:
       UserError: in one line, if he reaches too few.
     """
-    lower, upper = jnp.asarray(world.lower)[task], jnp.asarray(world.upper)[task]
-    reach = np.linalg.norm(np.ptp(world.benchmark(task), axis=0) / scale.width[task])
-    kept: list[tuple[np.ndarray, ...]] = []
+    kept: dict[int, Demonstrations] = {}
     for turn in range(ROUNDS):
-        key = modes.key(task) if turn == 0 else jax.random.fold_in(modes.key(task), turn)
-        goals = jax.random.uniform(key, (TRIES * count, 4), minval=lower, maxval=upper)
-        sequences, lengths = world.demonstrate(task, goals)
-        found = world.execute(jnp.clip(sequences, -1.0, 1.0), lengths, key=key)
-        apart = jnp.linalg.norm((found.value[:, task] - goals) / scale.width[task], axis=-1)
-        near = np.asarray(found.reached[:, task] & (apart < SKILFUL * reach))
-        shown = jnp.clip(sequences, -1.0, 1.0), lengths, found.value[:, task]
-        kept.append(tuple(np.asarray(leaf)[near] for leaf in shown))
-        together = [np.concatenate(leaves)[:count] for leaves in zip(*kept, strict=True)]
-        if len(together[0]) == count:
-            return Demonstrations.plain(*together)
+        for task, (goals, reached, demos) in _tried(world, tasks, TRIES * count, turn).items():
+            reach = np.linalg.norm(np.ptp(world.benchmark(task), axis=0) / scale.width[task])
+            apart = np.linalg.norm((demos.outcomes - goals) / scale.width[task], axis=-1)
+            near = Demonstrations(*(leaf[reached & (apart < SKILFUL * reach)] for leaf in demos))
+            together = zip(*([kept[task], near] if turn else [near]), strict=True)
+            kept[task] = Demonstrations(*(np.concatenate(leaves)[:count] for leaves in together))
+        if all(len(demos.lengths) == count for demos in kept.values()):
+            return kept
+    few = next(task for task in tasks if len(kept[task].lengths) < count)
     raise ConfigError(
-        f"saht.teachers: the teacher of {world.names[task]} reaches {len(together[0])} of {ROUNDS * TRIES * count} "
-        f"goals; allowed: at least {count}, its demos"
+        f"saht.teachers: the teacher of {world.names[few]} reaches {len(kept[few].lengths)} of "
+        f"{ROUNDS * TRIES * count} goals; allowed: at least {count}, its demos"
     )
+
+
+def _tried(
+    world: World, tasks: Sequence[int], count: int, turn: int
+) -> dict[int, tuple[np.ndarray, np.ndarray, Demonstrations]]:
+    """Of each task goals [count, 4], which of them had an outcome, and what its teacher did for them.
+
+    The programs of all tasks, and that which executes, compile side by side.
+    """
+    drawn = [_drawn(np.uint32(task), turn, world.lower[task], world.upper[task], count) for task in tasks]
+    keys, goals = zip(*jax.device_get(drawn), strict=True)
+    still = jnp.asarray(np.zeros((count, world.longest, world.primitive), np.float32))
+    once = jnp.asarray(np.ones(count, np.int32))
+    with ThreadPoolExecutor() as pool:
+        compiles = pool.submit(world.execute, still, once, key=keys[0])
+        done = [jax.device_get(one) for one in pool.map(world.demonstrate, tasks, goals)]
+        compiles.result()
+    tried = {}
+    for task, key, goal, (sequences, lengths) in zip(tasks, keys, goals, done, strict=True):
+        sequences = np.clip(sequences, -1.0, 1.0)
+        found = jax.device_get(world.execute(sequences, lengths, key=key))
+        demos = Demonstrations.plain(sequences, lengths, found.value[:, task])
+        tried[task] = goal, found.reached[:, task], demos
+    return tried
+
+
+@partial(jax.jit, static_argnums=4)
+def _drawn(task: Array, turn: Array, lower: Array, upper: Array, count: int) -> tuple[Array, Array]:
+    """A key, and goals [count, 4] drawn evenly between bounds [4] with it."""
+    first = modes.key(task)
+    key = jnp.where(turn == 0, first, jax.random.fold_in(first, turn))
+    return key, jax.random.uniform(key, (count, 4), minval=lower, maxval=upper)
+
+
+@jax.jit
+def _scaled(values: Array, lower: Array, width: Array) -> Array:
+    return (values - lower) / width
 
 
 def save(path: Path, world: World, tasks: Sequence[str], demos: Demonstrations) -> None:

@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import json
 import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,7 @@ _ABOUT = "about.json"
 _MERGED = "manifest.ocdbt"  # of orbax, once all that was written is found
 _WRITING, _LEAVING = ".partial", ".removed"  # hidden folders that a process which was killed may leave
 _ASIDE = ".damaged"
+_CHUNK = 2**24  # bytes of an array that are compressed as one: by default 2 GiB, so that few cores would compress
 
 
 class Damaged(ConfigError):
@@ -76,8 +77,10 @@ class Checkpoints:
                 self._clean()
                 writing.mkdir()
             devices.wait("there is a folder to write to")
+            arrays = plain(state)
+            chunked = jax.tree.map(lambda _: ocp.SaveArgs(chunk_byte_size=_CHUNK), arrays)
             with memory_given_back():
-                self._open().save(writing.absolute() / "state", args=ocp.args.StandardSave(plain(state)))
+                self._open().save(writing.absolute() / "state", args=ocp.args.StandardSave(arrays, chunked))
             if devices.first():
                 if not (writing / "state" / _MERGED).exists():  # orbax would only have warned
                     raise OSError(errno.EIO, "orbax has not put its parts together")
@@ -375,14 +378,12 @@ def _older(path: Path) -> Path:
 
 def _sums(path: Path) -> str:
     """The output of `sha256sum` for all files below `path` but its `SHA256SUMS`, in the order of their names."""
-    lines = []
-    for entry in sorted(path.rglob("*")):
-        if entry.is_file() and entry != path / SUMS:
-            with entry.open("rb") as file:
-                lines.append(
-                    f"{hashlib.file_digest(file, 'sha256').hexdigest()}  {entry.relative_to(path).as_posix()}\n"
-                )
-    return "".join(lines)
+
+    def line(entry: Path) -> str:
+        return f"{files.sha256(entry)}  {entry.relative_to(path).as_posix()}\n"
+
+    with ThreadPoolExecutor() as pool:  # hashing large files is work for all cores
+        return "".join(pool.map(line, sorted(x for x in path.rglob("*") if x.is_file() and x != path / SUMS)))
 
 
 def _cause(error: Exception) -> str:

@@ -27,16 +27,16 @@ class JsonLines:
         self.path = path
         self._muted = muted
 
-    def write(self, row: Mapping[str, Any]) -> None:
-        """Append one line; numbers that JSON cannot hold become null."""
-        if self._muted:
+    def write(self, *rows: Mapping[str, Any]) -> None:
+        """Append a line for each row, all or none of them; numbers that JSON cannot hold become null."""
+        if self._muted or not rows:
             return
-        clean = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+        lines = "".join(json.dumps(_clean(row)) + "\n" for row in rows)
         try:
             before = self.path.stat().st_size if self.path.exists() else 0
             try:
                 with self.path.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(clean) + "\n")
+                    file.write(lines)
             except OSError:
                 with contextlib.suppress(OSError):  # half a line, on a disk that is full
                     os.truncate(self.path, before)
@@ -118,10 +118,14 @@ class Journal:
             lines.sync()
 
 
+def _clean(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+
+
 def of_epoch(metrics: dict[str, jax.Array], seeds: list[int]) -> list[dict[str, Any]]:
     """One row per seed of the `metrics` of an epoch, arrays with a leading axis of seeds."""
-    host = jax.device_get(metrics)
-    return [{"seed": seed} | {k: v[i].item() for k, v in host.items()} for i, seed in enumerate(seeds)]
+    host = {name: values.tolist() for name, values in jax.device_get(metrics).items()}
+    return [dict(zip(("seed", *host), row, strict=True)) for row in zip(seeds, *host.values(), strict=True)]
 
 
 def by_step(rows: Sequence[Mapping[str, Any]]) -> list[list[Mapping[str, Any]]]:

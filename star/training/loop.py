@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -143,8 +144,9 @@ class Loop:
         program, seeds = self._program, self._program.seeds
         self._trace.before(self._done)
         evaluated = self._is_due(program.config.trainer.eval_every, self._done + 1)
+        kept = self._done <= max(self._saved, 0)  # on disk, or made anew from the seeds
         long = self._stopwatch.expected("epoch", *["evaluation"] * evaluated) > _LONG_S
-        self._spare = (self._done, _copied(state)) if long and not self._stop.patient else None
+        self._spare = (self._done, _copied(state)) if long and not kept and not self._stop.patient else None
         with self._stopwatch.measure("epoch"):
             state, table = self._stop.during(partial(self._compute, state))
         speed = program.steps_per_epoch * len(seeds) / self._stopwatch.last("epoch")
@@ -172,8 +174,10 @@ class Loop:
                     self._display.note(f"seed {seed}: {line}")
 
     def _compute(self, state: Any) -> tuple[Any, list[dict[str, Any]]]:
-        state, metrics = self._program.epoch(state)
-        return state, of_epoch(metrics, self._program.seeds)
+        first = self._done == self._began and jax.process_count() == 1  # several would have to compile in one order
+        with self._program.preparing() if first else nullcontext():
+            state, metrics = self._program.epoch(state)
+            return state, of_epoch(metrics, self._program.seeds)
 
     def _evaluate(self, state: Any) -> Any:
         return jax.block_until_ready(self._program.evaluate(state, self._program.evaluation_keys(self._done)))
@@ -219,7 +223,8 @@ class Loop:
 
 def _copied(state: Any) -> Any:
     """A copy of `state` on the host: an epoch uses up what it is given."""
-    return jax.tree.map(np.array, plain(state))
+    found = jax.device_get(plain(state))
+    return jax.tree.map(np.array, found) if jax.default_backend() == "cpu" else found  # there it is the state itself
 
 
 def _title(program: Program) -> str:

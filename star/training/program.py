@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
+from importlib import import_module
 from typing import Any
 
 import jax
@@ -66,6 +69,19 @@ class Program:
     def evaluate(self, state: Any, keys: jax.Array) -> Any:
         """The experiment's evaluation of each state, such as greedy episodes on test goals."""
         return self.functions.evaluate(self.hyper, state, keys)
+
+    @contextmanager
+    def preparing(self) -> Iterator[None]:
+        """The evaluation compiles in a thread, and Matplotlib is imported there, while the body goes on.
+
+        Errors of either are left to its first use.
+        """
+        evaluate = self.functions.evaluate
+        with ThreadPoolExecutor(max_workers=1) as pool:
+            if isinstance(evaluate, jax.stages.Wrapped):
+                pool.submit(lambda: evaluate.lower(self.hyper, self.example(), self.evaluation_keys(0)).compile())
+            pool.submit(import_module, "matplotlib.figure")
+            yield
 
     def rows(self, evaluated: Any) -> list[dict[str, Any]]:
         """The evaluation of each seed, as plain numbers with the keys of rows of metrics."""
@@ -162,10 +178,13 @@ def seed_keys(seeds: Sequence[int]) -> jax.Array:
 
 def evaluation_keys(seeds: Sequence[int], numbers: Sequence[int] | np.ndarray, *, stream: int) -> jax.Array:
     """Keys of one evaluation of each seed; `numbers` are those of `Program.evaluation_keys`."""
+    return _folded(np.asarray(numbers, np.uint32), np.asarray(seeds, np.uint32), stream)
+
+
+@partial(jax.jit, static_argnums=2)
+def _folded(numbers: jax.Array, seeds: jax.Array, stream: int) -> jax.Array:
     base, fold = modes.key(stream), jax.random.fold_in
-    return jax.vmap(lambda number, seed: fold(fold(base, number), seed))(
-        np.asarray(numbers, np.uint32), np.asarray(seeds, np.uint32)
-    )
+    return jax.vmap(lambda number, seed: fold(fold(base, number), seed))(numbers, seeds)
 
 
 def _as_on_first(state: Any, placement: Any) -> Any:

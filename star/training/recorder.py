@@ -32,13 +32,12 @@ class Recorder:
         for row in table:
             row |= {"env_steps": env_steps, "wall_s": round(time.monotonic() - self._began, 3)}
             row |= {"env_steps_per_s": round(speed)}
-            self.journal.metrics.write(row)
+        self.journal.metrics.write(*table)
         self._notice(table)
 
     def add_tables(self, state: Any, *, env_steps: int) -> None:
         """The experiment's records at an evaluation besides metrics."""
-        for row in self._tables(state, env_steps):
-            self.journal.tables.write(row)
+        self.journal.tables.write(*self._tables(state, env_steps))
 
     def tables(self, state: Any, *, env_steps: int) -> list[dict[str, Any]]:
         """All such rows, those of `state` included, if there is one; it may not have been evaluated."""

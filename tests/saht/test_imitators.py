@@ -135,9 +135,18 @@ def test_confidence_agrees_with_a_slow_computation(n):
 def test_a_teacher_shows_what_he_can_where_most_goals_are_out_of_reach():
     far = dataclasses.replace(TASKS[0], lower=(-40.0, -40.0), upper=(40.0, 40.0))
     world = dataclasses.replace(WORLD, tasks=(far,), simulate=lambda s, n: (worlds.outcomes((2 * s[0], True)), s))
-    demos = teachers.demonstrated(world, 0, 5, scale_of(world))  # of 320 goals one is within 2
+    demos = teachers.demonstrated(world, [0], 5, scale_of(world))[0]  # of 320 goals one is within 2
     assert len(demos.lengths) == 5 and np.abs(demos.outcomes).max() <= 2
     np.testing.assert_allclose(demos.outcomes[:, :2], 2 * demos.sequences[:, 0], atol=1e-6)
+
+
+def test_what_a_teacher_shows_does_not_depend_on_who_else_is_asked():
+    scale = scale_of(WORLD)
+    together = teachers.demonstrated(WORLD, [0, 1], 5, scale)
+    for task, demos in together.items():
+        (alone,) = teachers.demonstrated(WORLD, [task], 5, scale).values()
+        jax.tree.map(np.testing.assert_array_equal, demos, alone)
+    assert not np.array_equal(together[0].sequences, together[1].sequences)
 
 
 def test_a_world_in_which_nobody_shows_a_task_has_no_such_learners():

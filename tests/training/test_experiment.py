@@ -8,6 +8,7 @@ import shutil
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 import yaml
@@ -76,6 +77,16 @@ def test_what_there_is_to_note_is_said_once_of_each_seed_unless_quiet_is_wanted(
     assert main(["train", "noted.yaml", "--run-dir", "told"]) == 0
     lines = [line for line in "".join(capsys.readouterr()).splitlines() if line.startswith("note:")]
     assert lines == [f"note: seed {seed}: ['bandit/error', 'env_steps'] since 7" for seed in range(5)]
+
+
+def test_the_evaluation_compiles_once_in_a_thread_beside_the_first_epoch(here, caplog):
+    jax.config.update("jax_log_compiles", True)
+    try:
+        trained("run", "--trainer.num_seeds", "7", "--trainer.eval_every", "10")
+    finally:
+        jax.config.update("jax_log_compiles", False)
+    threads = [one.threadName for one in caplog.records if one.getMessage().startswith("Compiling jit(evaluate)")]
+    assert len(threads) == 1 and threads[0].startswith("ThreadPool")
 
 
 def test_it_trains_and_goes_on_bit_for_bit(here):
