@@ -12,6 +12,8 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float
 
+_LEAST = 1e-6
+
 
 class MLP(nn.Module):
     """Dense layers of the widths `hidden`, then a linear layer of width `out`.
@@ -43,6 +45,11 @@ class MLP(nn.Module):
 def apply(mlp: MLP, params: Any, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
     """Output of `mlp` with `params` for the last axis of `x`."""
     return jnp.asarray(mlp.apply(params, x))
+
+
+def distance(x: Float[Array, "*batch n"], y: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
+    """||x - y||, with a slope everywhere."""
+    return jnp.sqrt(jnp.square(x - y).sum(axis=-1) + _LEAST)
 
 
 def descend(

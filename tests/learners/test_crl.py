@@ -8,7 +8,8 @@ from scipy import stats
 
 from star.config import loading
 from star.config.section import ConfigError
-from star.learners import crl, replay
+from star.learners import crl, futures, replay
+from star.learners.futures import Future, Step
 from star.learners.replay import Track, Transition
 
 ENVS, LENGTH = 4, 6  # of a rollout
@@ -58,14 +59,14 @@ def slow_left(steps):
 @pytest.mark.parametrize("rollouts", [1, 3, 4, 7])
 def test_goals_lie_ahead_in_the_same_episode_also_where_the_buffer_has_begun_anew(rollouts):
     rng = np.random.default_rng(rollouts)
-    ring = replay.create(crl._step(EXAMPLE), size=4 * LENGTH * ENVS)
+    ring = replay.create(Step.of(EXAMPLE), size=4 * LENGTH * ENVS)
     steps = []
     for number in range(rollouts):
-        one = crl._step(rollout(rng, epoch=number // 2))
+        one = Step.of(rollout(rng, epoch=number // 2))
         ring = replay.add(ring, replay.flatten(one))
         steps += [jax.tree.map(lambda x, t=t: x[t], one) for t in range(LENGTH)]
     kept = steps[-4 * LENGTH :]
-    found = np.asarray(crl.steps_left(ring, num_envs=ENVS)).reshape(-1, ENVS)
+    found = np.asarray(futures.steps_left(ring, num_envs=ENVS)).reshape(-1, ENVS)
     first = len(steps) % (4 * LENGTH) if len(steps) > len(kept) else 0
     np.testing.assert_array_equal(np.roll(found, -first, axis=0)[: len(kept)], slow_left(kept))
     assert not found[len(kept) :].any() and found.max() > 2
@@ -73,9 +74,9 @@ def test_goals_lie_ahead_in_the_same_episode_also_where_the_buffer_has_begun_ane
 
 def test_it_draws_every_step_that_another_follows_and_its_goal_from_the_steps_that_follow():
     rng, chosen = np.random.default_rng(5), settings(batch_size=96)
-    ring, steps = replay.create(crl._step(EXAMPLE), size=4 * LENGTH * ENVS), []
+    ring, steps = replay.create(Step.of(EXAMPLE), size=4 * LENGTH * ENVS), []
     for number in range(3):  # a quarter of the buffer stays empty
-        one = crl._step(rollout(rng, epoch=number // 2))
+        one = Step.of(rollout(rng, epoch=number // 2))
         ring = replay.add(ring, replay.flatten(one))
         steps += [jax.tree.map(lambda x, t=t: x[t], one) for t in range(LENGTH)]
     left = slow_left(steps)
@@ -83,7 +84,7 @@ def test_it_draws_every_step_that_another_follows_and_its_goal_from_the_steps_th
         float(steps[t].obs[b, 0]): {tuple(steps[t + n].track.place[b]) for n in range(1, left[t, b] + 1)}
         for t, b in np.argwhere(left)
     }
-    draw = jax.jit(lambda key: crl._drawn(chosen, ring, crl.Future.of(ring, num_envs=ENVS), key))
+    draw = jax.jit(lambda key: crl._drawn(chosen, ring, Future.of(ring, num_envs=ENVS), key))
     seen = set()
     for number in range(10):
         batch, goal = draw(jax.random.key(number))
@@ -95,8 +96,8 @@ def test_it_draws_every_step_that_another_follows_and_its_goal_from_the_steps_th
 
 
 def test_a_buffer_in_which_nothing_follows_gives_a_batch_without_weight():
-    ring = replay.create(crl._step(EXAMPLE), size=4 * LENGTH * ENVS)
-    future = crl.Future.of(ring, num_envs=ENVS)
+    ring = replay.create(Step.of(EXAMPLE), size=4 * LENGTH * ENVS)
+    future = Future.of(ring, num_envs=ENVS)
     assert not crl._drawn(settings(), ring, future, jax.random.key(0))[0].weight.any()
 
 
@@ -112,10 +113,10 @@ def test_networks_begin_with_weights_as_small_as_those_of_jaxgcrl():
 
 def test_how_far_goals_lie_ahead_is_geometric_and_cut_off_at_the_end():
     uniform = jax.random.uniform(jax.random.key(0), (20_000,))
-    drawn = np.asarray(crl.ahead(jnp.full(uniform.shape, 5), uniform, discount=0.8))
+    drawn = np.asarray(futures.ahead(jnp.full(uniform.shape, 5), uniform, discount=0.8))
     wanted = 0.8 ** np.arange(5)
     assert stats.chisquare(np.bincount(drawn, minlength=6)[1:], len(drawn) * wanted / wanted.sum()).pvalue > 1e-4
-    assert np.asarray(crl.ahead(jnp.zeros(3, int), uniform[:3], discount=0.8)).tolist() == [0, 0, 0]
+    assert np.asarray(futures.ahead(jnp.zeros(3, int), uniform[:3], discount=0.8)).tolist() == [0, 0, 0]
 
 
 def slow_mlp(params, x):
@@ -129,7 +130,7 @@ def slow_mlp(params, x):
 def test_the_critic_tells_its_own_goal_from_those_of_others():
     chosen = settings(hidden=[8], representation=3, logsumexp_penalty=0.2)
     state, rng = crl.init(jax.random.key(1), chosen, example=EXAMPLE), np.random.default_rng(2)
-    batch = jax.tree.map(lambda x: jnp.asarray(x[:, 0]), crl._step(rollout(rng, 0)))
+    batch = jax.tree.map(lambda x: jnp.asarray(x[:, 0]), Step.of(rollout(rng, 0)))
     batch = batch.replace(weight=jnp.asarray([1.0, 1, 0, 1, 1, 1]))
     goal = rng.normal(size=(LENGTH, 2)).astype(np.float32)
     critic, obs = state.params["critic"], np.float64(batch.obs)
