@@ -24,14 +24,12 @@ from jaxtyping import Array, Float
 from star import devices
 from star.learners import futures, replay, squashed
 from star.learners.futures import Future, ReplayState, Step, ahead
-from star.learners.networks import MLP, apply, distance
+from star.learners.networks import MLP, VARIANCE, apply, distance
 from star.learners.protocol import Learner
 from star.learners.replay import Imitation, Penalty, Relabel, Transition, weighted_mean
 from star.learners.sections import CRLConfig
 
 Metrics = dict[str, Array]
-
-VARIANCE = 1 / 3  # of an initial weight, times the inputs of its layer
 
 
 def _mlp(config: CRLConfig, out: int) -> MLP:

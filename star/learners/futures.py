@@ -91,8 +91,8 @@ class Future(NamedTuple):
         return self.going[jax.random.randint(key, (size,), 0, jnp.maximum(self.number, 1))]
 
     def later(
-        self, x: Float[Array, "size *more"], item: Int[Array, "*n"], steps: Int[Array, "*n"]
-    ) -> Float[Array, "*n *more"]:
+        self, x: Float[Array, "size ..."], item: Int[Array, "#*n"], steps: Int[Array, "#*n"]
+    ) -> Float[Array, "..."]:
         """`x` of all items, so many env steps after each `item`; within `left` it is of the same episode."""
         return x[(item + steps * self.num_envs) % len(self.left)]
 

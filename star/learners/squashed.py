@@ -17,7 +17,7 @@ ENTROPY = -0.5  # wanted of each number of an action, nats
 _LEAST = 1e-6
 
 
-def moments(out: Float[Array, "*batch 2n"]) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]:
+def moments(out: Float[Array, "*batch m"]) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n"]]:
     """Mean and deviation of actions before tanh, of what a network puts out."""
     mean, raw = jnp.split(out, 2, axis=-1)
     low, high = LOG_STD
