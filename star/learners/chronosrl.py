@@ -36,10 +36,10 @@ from star.learners.sections import ChronoSRLConfig
 Metrics = dict[str, Array]
 
 LATER, OWN = 0.85, 0.05  # shares of goals that are later places, and the agent's own; the rest are places of others
-CIRCLES = 0.5 ** np.arange(3)  # times the radius: at the goal is who is in all of them, by a third in one
+CIRCLES = 0.5 ** np.arange(3)  # times the radius: the share of these in which an agent is says how far it is there
 BINS = 32  # at most, of occupancy
-BASIS = 64  # numbers of which all logits of hazards are sums
-BEND = 0.1  # how much a goal bends the representation of an action
+BASIS = 64  # functions of time of which logits of hazards are weighted sums
+FILM = 0.1  # scale of what a goal does to the representation of an action (FiLM, Perez et al. 2018)
 
 
 class Step(futures.Step):
@@ -65,8 +65,8 @@ class Batch(struct.PyTreeNode):
     weight: Float[Array, "N"]
 
 
-class Outlook(NamedTuple):
-    """What the critic says of actions and goals: representations, and logits of hazards (T = H + 1) and occupancy."""
+class Prediction(NamedTuple):
+    """The critic's: representations of actions and goals, and logits of hazards (T = H + 1) and occupancy."""
 
     action: Float[Array, "N n"]
     goal: Float[Array, "N n"]
@@ -84,20 +84,20 @@ class Critic(nn.Module):
 
     @nn.compact
     def __call__(
-        self, state: Float[Array, "*N state"], action: Float[Array, "*N act"], goal: Float[Array, "*N k"]
-    ) -> Outlook:
-        """The outlook of actions [*N, chunk * act] in states, for goals."""
+        self, state: Float[Array, "*N state"], action: Float[Array, "*N acts"], goal: Float[Array, "*N k"]
+    ) -> Prediction:
+        """The prediction for chunks of actions in states, and goals."""
         mlp, size = partial(ResidualMLP, self.width, self.blocks), self.representation
         phi = mlp(size, name="action")(jnp.concatenate([state, action], axis=-1))
         psi = mlp(size, name="goal")(goal)
-        scale, shift = jnp.split(uniform_dense(2 * size, name="bend")(psi), 2, axis=-1)
-        bent = (1 + BEND * scale) * phi + BEND * shift
-        count = BASIS + bins(self.horizon)[-1] + 1
-        head = mlp(1 + count, name="head")(jnp.concatenate([bent, psi, bent - psi, bent * psi], axis=-1))
-        now, sums, occupancy = jnp.split(head, (1, 1 + BASIS), axis=-1)
+        scale, shift = jnp.split(uniform_dense(2 * size, name="film")(psi), 2, axis=-1)
+        modulated = (1 + FILM * scale) * phi + FILM * shift
+        together = jnp.concatenate([modulated, psi, modulated - psi, modulated * psi], axis=-1)
+        head = mlp(1 + BASIS + bins(self.horizon)[-1] + 1, name="head")(together)
+        now, weights, occupancy = jnp.split(head, (1, 1 + BASIS), axis=-1)
         basis = self.param("basis", nn.initializers.normal(0.02), (BASIS, self.horizon))
         bias = self.param("bias", nn.initializers.zeros, (self.horizon,))
-        return Outlook(phi, psi, jnp.concatenate([now, sums @ basis + bias], axis=-1), occupancy)
+        return Prediction(phi, psi, jnp.concatenate([now, weights @ basis + bias], axis=-1), occupancy)
 
 
 def bins(horizon: int) -> Int[np.ndarray, "H"]:
@@ -111,7 +111,7 @@ def log_later(hazard: Float[Array, "*N T"]) -> Float[Array, "*N T"]:
     return jnp.cumsum(jax.nn.log_sigmoid(-hazard), axis=-1)
 
 
-def surprise(hazard: Float[Array, "*N T"], arrival: Int[Array, "*N"]) -> Float[Array, "*N"]:
+def nll(hazard: Float[Array, "*N T"], arrival: Int[Array, "*N"]) -> Float[Array, "*N"]:
     """-log P(tau = `arrival`); for H + 1 that of tau > H."""
     certain = jnp.zeros((*arrival.shape, 1))
     before = jnp.concatenate([certain, log_later(hazard)], axis=-1)
@@ -122,12 +122,12 @@ def surprise(hazard: Float[Array, "*N T"], arrival: Int[Array, "*N"]) -> Float[A
 def cost(hazard: Float[Array, "*N T"], *, discount: Array | float) -> Float[Array, "*N"]:
     """Expected discounted env steps to the goal, at most H: sum of gamma^t P(tau > t) over t < H."""
     later = jnp.exp(log_later(hazard)[..., :-1])
-    return later @ jnp.power(discount, jnp.arange(later.shape[-1]))
+    return jnp.sum(later * jnp.power(discount, jnp.arange(later.shape[-1])), axis=-1)
 
 
 def stay(occupancy: Float[Array, "*N bins"], *, discount: Array | float, horizon: int) -> Float[Array, "*N"]:
     """Expected discounted env steps at the goal, from the logits of occupancy."""
-    return jax.nn.sigmoid(occupancy) @ _binned(jnp.power(discount, jnp.arange(1, horizon + 1)))
+    return jnp.sum(jax.nn.sigmoid(occupancy) * _binned(jnp.power(discount, jnp.arange(1, horizon + 1))), axis=-1)
 
 
 def _binned(x: Float[Array, "*N H"]) -> Float[Array, "*N bins"]:
@@ -136,7 +136,7 @@ def _binned(x: Float[Array, "*N H"]) -> Float[Array, "*N bins"]:
     return jnp.matmul(x, jax.nn.one_hot(number, number[-1] + 1), precision=jax.lax.Precision.HIGHEST)
 
 
-def outcome(
+def labels(
     away: Float[Array, "N T"], left: Int[Array, "N"], ends: Float[Array, "N"], *, radius: Array | float
 ) -> tuple[Int[Array, "N"], Float[Array, "N bins"], Float[Array, "N bins"]]:
     """`arrival`, `occupancy` and `seen` of a batch, given how far `away` from the goal the agent is 0..H steps later.
@@ -207,8 +207,13 @@ def update(
 
     Goals of the future take the place of `relabel`, and only a Tutor has a `penalty`.
     """
-    one, least = partial(_one_update, config, imitation), max(1, config.action_chunk - 1)
-    return futures.learn(one, state, _step(rollout), least=least, updates=config.updates_per_rollout, key=key)
+    one = partial(_one_update, config, imitation)
+    return futures.learn(one, state, _step(rollout), least=_least(config), updates=config.updates_per_rollout, key=key)
+
+
+def _least(config: ChronoSRLConfig) -> int:
+    """The number of steps of the same episode that follow the first one of a chunk, at least."""
+    return max(1, config.action_chunk - 1)
 
 
 def _drawn(config: ChronoSRLConfig, ring: replay.Ring, future: Future, key: Array) -> Batch:
@@ -220,7 +225,7 @@ def _drawn(config: ChronoSRLConfig, ring: replay.Ring, future: Future, key: Arra
     goal = _goals(config, items, future, slot, goal_key)
     ways = future.later(items.track.place, slot[:, None], jnp.arange(config.horizon + 1)) - goal[:, None]
     ends = future.later(items.terminated, slot, left)
-    arrival, occupancy, seen = outcome(jnp.linalg.norm(ways, axis=-1), left, ends, radius=config.radius)
+    arrival, occupancy, seen = labels(jnp.linalg.norm(ways, axis=-1), left, ends, radius=config.radius)
     chunk = future.later(items.action, slot[:, None], jnp.arange(config.action_chunk))
     return Batch(
         obs=items.obs[slot].at[:, -goal.shape[-1] :].set(goal),
@@ -230,7 +235,7 @@ def _drawn(config: ChronoSRLConfig, ring: replay.Ring, future: Future, key: Arra
         occupancy=occupancy,
         seen=seen,
         ends=ends,
-        weight=items.weight[slot] * (left > 0),
+        weight=items.weight[slot] * (left >= _least(config)),
     )
 
 
@@ -264,13 +269,13 @@ def _one_update(
     return state.replace(updates=state.updates + ready.astype(jnp.int32)), metrics
 
 
-def _outlook(config: ChronoSRLConfig, critic: Any, batch: Batch, action: Array) -> Outlook:
+def _predicted(config: ChronoSRLConfig, critic: Any, batch: Batch, action: Array) -> Prediction:
     found = _critic(config).apply(critic, batch.obs[:, : -batch.goal.shape[-1]], action, batch.goal)
-    return Outlook(*found)
+    return Prediction(*found)
 
 
 def _critic_loss(config: ChronoSRLConfig, critic: Any, batch: Batch) -> tuple[Array, Metrics]:
-    found, never = _outlook(config, critic, batch, batch.action), batch.arrival > config.horizon
+    found, never = _predicted(config, critic, batch, batch.action), batch.arrival > config.horizon
     step, pairs = -jnp.log(config.discount), distance(found.action[:, None], found.goal[None])
     error = jnp.diagonal(pairs) - step * batch.arrival
     hinge = jnp.maximum(config.horizon * step - pairs, 0)
@@ -278,7 +283,7 @@ def _critic_loss(config: ChronoSRLConfig, critic: Any, batch: Batch) -> tuple[Ar
     wrong = jax.nn.softplus(found.occupancy) - found.occupancy * batch.occupancy
     reached = batch.weight * (~never & (batch.arrival > 0))
     losses = {
-        "arrival_loss": weighted_mean(surprise(found.hazard, batch.arrival), batch.weight),
+        "arrival_loss": weighted_mean(nll(found.hazard, batch.arrival), batch.weight),
         "occupancy_loss": weighted_mean(wrong, batch.seen * batch.weight[:, None]),
         "time_loss": weighted_mean(jnp.where(abs(error) < 1, 0.5 * error**2, abs(error) - 0.5), reached),
         "separation_loss": weighted_mean(hinge, apart * batch.weight[:, None] * batch.weight),
@@ -297,7 +302,7 @@ def _actor_loss(
     key: Array,
 ) -> tuple[Array, Metrics]:
     action, log_prob = squashed.draw(*_policy(config, actor, batch.obs), key=key)
-    found = _outlook(config, critic, batch, action)
+    found = _predicted(config, critic, batch, action)
     late, ends = cost(found.hazard, discount=config.discount), weighted_mean(batch.ends, batch.weight)
     there = stay(found.occupancy, discount=config.discount, horizon=config.horizon)
     loss = weighted_mean(jnp.exp(log_alpha) * log_prob + late - ends * there, batch.weight)

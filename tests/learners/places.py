@@ -5,12 +5,35 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+from star.config import loading
+from star.config.section import ConfigError
 from star.learners import replay
 from star.learners.replay import Track, Transition
 
 ENVS, LENGTH = 4, 6  # of a rollout
 CAPACITY = 4 * LENGTH * ENVS
+SMALL = {"buffer_size": CAPACITY, "batch_size": 16, "min_transitions": 24}
+
+
+def parsed(learner, settings):
+    """A small run whose Controller learns by `learner` with `settings`."""
+    level = {"learner": learner, "frame": "map", learner: settings}
+    small = {"trainer": {"num_envs": ENVS}, "tutor": {"enabled": False, "period": LENGTH}, "commander": {"period": 6}}
+    return loading.parse({"controller": level, **small})
+
+
+def refused(config, changes):
+    """The line that tells what is wrong with `config` after `changes` of its sections."""
+    values = config.model_dump(mode="json")
+    for section, changed in changes.items():
+        for key, value in changed.items():
+            values[section][key] = values[section][key] | value if isinstance(value, dict) else value
+    with pytest.raises(ConfigError) as caught:
+        loading.parse(values)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
 
 
 def rollout(rng, epoch):
