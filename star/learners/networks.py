@@ -87,8 +87,8 @@ def apply(mlp: nn.Module, params: Any, x: Float[Array, "*batch n"]) -> Float[Arr
     return jnp.asarray(mlp.apply(params, x))
 
 
-def distance(x: Float[Array, "*batch n"], y: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-    """||x - y||, with a slope everywhere."""
+def distance(x: Float[Array, "#*batch n"], y: Float[Array, "#*batch n"]) -> Float[Array, "..."]:
+    """||x - y|| of vectors along the last axis, with a slope everywhere; the other axes are broadcast."""
     return jnp.sqrt(jnp.square(x - y).sum(axis=-1) + _LEAST)
 
 
