@@ -138,6 +138,7 @@ LONGEST = (
     "test_physics.py",
     "test_sb3.py",
     "test_films.py",
+    "test_chronosrl.py",
     "test_crl.py",
     "test_environment.py",
     "test_td3.py",

@@ -39,6 +39,7 @@ import envs
 from envs.ant import HEALTHY
 from scripts.checks.against_jaxgcrl import loaded, theirs
 from star.learners import crl
+from star.learners.futures import ReplayState, Step
 from star.learners.replay import Track, Transition
 from star.learners.sections import CRLConfig
 
@@ -64,7 +65,7 @@ class Batch(NamedTuple):
     extras: dict[str, jax.Array]
 
 
-def learner() -> tuple[CRLConfig, crl.CRLState]:
+def learner() -> tuple[CRLConfig, ReplayState]:
     """Ours before it has learnt."""
     config, zero = CRLConfig(buffer_size=256), jnp.zeros(())
     seen, track = jnp.zeros(STATE + GOAL), Track(jnp.zeros(GOAL), zero, zero)
@@ -100,7 +101,7 @@ def their_gradients(clone: Path, config: CRLConfig) -> Callable[..., tuple[Any, 
     return gradients
 
 
-def our_gradients(config: CRLConfig, params: Any, batch: crl.Step, goal: jax.Array, key: jax.Array) -> Any:
+def our_gradients(config: CRLConfig, params: Any, batch: Step, goal: jax.Array, key: jax.Array) -> Any:
     """The gradients of our actor and critic, and the metrics of both."""
     actor, critic, log_alpha = params
     slope, told = jax.grad(partial(crl._actor_loss, config, None), has_aux=True)(
@@ -123,7 +124,7 @@ def compared(clone: Path) -> dict[str, Any]:
         seen, action, goal = 3 * draw[0], jnp.tanh(draw[1]), 5 * draw[2]
         key, none = jax.random.key(number), jnp.zeros(256)
         track = Track(0 * goal, none, none)
-        batch = crl.Step(jnp.concatenate([seen, 0 * goal], axis=1), action, none + 1, track)
+        batch = Step(jnp.concatenate([seen, 0 * goal], axis=1), action, none + 1, track)
         (wanted_actor, wanted_critic, _), wanted = own(given, seen, action, goal, key)
         (slope, critic_slope), found = ours((actor, critic, state.log_alpha), batch, goal, key)
         wanted_critic = {"action": wanted_critic["sa_encoder"], "goal": wanted_critic["g_encoder"]}

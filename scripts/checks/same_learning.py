@@ -130,8 +130,15 @@ CRL: dict[str, Any] = POINT | {
     "controller.crl.hidden": [8], "controller.crl.batch_size": 16, "controller.crl.buffer_size": 480,
     "controller.crl.min_transitions": 16, "controller.crl.updates_per_rollout": 2,
 }  # fmt: skip
+CHRONOSRL: dict[str, Any] = POINT | {
+    "tutor.period": 30, "tutor.unroll": 1, "commander.period": 30,
+    "controller.chronosrl.width": 8, "controller.chronosrl.blocks": 1, "controller.chronosrl.batch_size": 16,
+    "controller.chronosrl.buffer_size": 480, "controller.chronosrl.min_transitions": 16,
+    "controller.chronosrl.updates_per_rollout": 2,
+}  # fmt: skip
 
 ROWS: dict[str, Row] = {
+    "agents/chronosrl": Row(settings=CHRONOSRL),
     "agents/crl": Row(settings=CRL),
     "agents/flat": Row(),
     "agents/flat_td3": Row(settings=POINT | SMALL_TD3),

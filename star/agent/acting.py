@@ -45,8 +45,8 @@ class _Functions(NamedTuple):
     """The jitted functions of an agent. Settings and state come first."""
 
     begin: Callable[..., tuple[TrainState, Roadmap, Memory, Array]]
-    decide: Callable[..., tuple[Memory, Array, Array]]
-    go_on: Callable[..., tuple[Array, Array]]
+    decide: Callable[..., tuple[Memory, Array, Array, Array]]
+    go_on: Callable[..., tuple[Array, Array, Array]]
     onward: Callable[..., Memory]
 
     @classmethod
@@ -58,7 +58,8 @@ class _Functions(NamedTuple):
 class _Episode:
     """State of the hierarchy in the episodes of B bodies, after `steps` env steps.
 
-    `before` is the last observation [B, n], and `shape` its leading axes as they were given: [] or [B].
+    `plan` is what the Controller has decided for the next env steps. `before` is the last observation [B, n], and
+    `shape` its leading axes as they were given: [] or [B].
     """
 
     state: TrainState
@@ -66,6 +67,7 @@ class _Episode:
     memory: Memory
     keys: Array
     subgoal: Any = None
+    plan: Any = None
     before: Any = None
     steps: int = 0
     shape: tuple[int, ...] = ()
@@ -136,11 +138,13 @@ class TrainedAgent:
         if within == 0:
             if segment:
                 episode.memory = functions.onward(hyper, episode.roadmap, episode.memory, batch)
-            episode.memory, episode.subgoal, action = functions.decide(
+            episode.memory, episode.subgoal, action, episode.plan = functions.decide(
                 hyper, episode.state, episode.roadmap, episode.memory, batch, episode.keys[segment]
             )
         else:
-            episode.subgoal, action = functions.go_on(hyper, episode.state, episode.subgoal, episode.before, batch)
+            episode.subgoal, action, episode.plan = functions.go_on(
+                hyper, episode.state, episode.subgoal, episode.before, batch, episode.plan, within
+            )
         episode.before, episode.steps = batch, episode.steps + 1
         episode.shape = given.shape[:-1]
         return np.clip(np.asarray(action), -1.0, 1.0).reshape(*episode.shape, -1)
@@ -179,7 +183,8 @@ class TrainedAgent:
         """Write the greedy Controller as a program of its own, which JAX runs without this package.
 
         It is `jax.export`'s file of StableHLO for CPUs and NVIDIA's GPUs, of a function from observations [B, n] and
-        subgoals [B, m], as of `subgoal`, to actions [B, act] in [-1, 1]; any B. It is read back by
+        subgoals [B, m], as of `subgoal`, to actions [B, act] in [-1, 1]; any B. Learner chronosrl gives those of
+        `controller.chronosrl.action_chunk` env steps, one after another. It is read back by
         `jax.export.deserialize(bytearray(Path(path).read_bytes())).call(obs, subgoal)`.
 
         Raises:
@@ -229,24 +234,31 @@ def _decide(
     memory: Memory,
     obs: Float[Array, "B n"],
     keys: Float[Array, "3"],
-) -> tuple[Memory, Array, Array]:
-    """The first env step of a segment: memory, subgoal and action."""
+) -> tuple[Memory, Array, Array, Array]:
+    """The first env step of a segment: memory, subgoal, action, and the Controller's plan."""
     agent = levels.of(config, spec, greedy=True)
     memory, _, _, choice = hierarchy.decide(
         agent, state, roadmap, memory, (), obs, spec.success(obs), env_steps=None, keys=(keys[0], keys[1], keys[2])
     )
-    seen = hierarchy.observe(agent, obs, choice.subgoal)
-    return memory, choice.subgoal, hierarchy.act(agent, state, seen, explore=False, key=keys[2])
+    seen, plan = hierarchy.observe(agent, obs, choice.subgoal), hierarchy.no_plan(agent, len(obs))
+    return memory, choice.subgoal, *hierarchy.act(agent, state, seen, plan, number=0, explore=False, key=keys[2])
 
 
 def _go_on(
-    spec: Spec, config: AgentConfig, state: TrainState, subgoal: Array, before: Array, obs: Array
-) -> tuple[Array, Array]:
-    """Any other env step: subgoal and action."""
+    spec: Spec,
+    config: AgentConfig,
+    state: TrainState,
+    subgoal: Array,
+    before: Array,
+    obs: Array,
+    plan: Array,
+    number: Array,
+) -> tuple[Array, Array, Array]:
+    """Env step `number` of a segment, not the first: subgoal, action and plan."""
     agent = levels.of(config, spec, greedy=True)
     subgoal = hierarchy.follow(agent, subgoal, before, obs)
     seen = hierarchy.observe(agent, obs, subgoal)
-    return subgoal, hierarchy.act(agent, state, seen, explore=False, key=state.key)
+    return subgoal, *hierarchy.act(agent, state, seen, plan, number=number, explore=False, key=state.key)
 
 
 def _onward(spec: Spec, config: AgentConfig, roadmap: Roadmap, memory: Memory, obs: Array) -> Memory:
@@ -259,8 +271,9 @@ def _exported(spec: Spec, config: AgentConfig, state: TrainState) -> bytearray:
     agent = levels.of(config, spec, greedy=True)
 
     def controller(obs: Float[Array, "B n"], subgoal: Float[Array, "B m"]) -> Float[Array, "B act"]:
-        seen = hierarchy.observe(agent, obs, subgoal)
-        return jnp.clip(hierarchy.act(agent, state, seen, explore=False, key=state.key), -1.0, 1.0)
+        seen, section = hierarchy.observe(agent, obs, subgoal), config.controller
+        action = agent.controller.act(section, state.controller, seen, explore=False, key=state.key)
+        return jnp.clip(action, -1.0, 1.0)
 
     (batch,) = export.symbolic_shape("B")
     sizes = (spec.state_dim + len(spec.goal_indices), agent.task.subgoals.size)

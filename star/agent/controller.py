@@ -81,16 +81,20 @@ def observe(
 
 def act(
     section: ControllerConfig, state: Any, seen: Float[Array, "*batch seen"], *, explore: bool, key: Array
-) -> Float[Array, "*batch act"]:
-    """Actions for what is `seen`; the environment clips them to [-1, 1]."""
+) -> Float[Array, "*batch acts"]:
+    """Actions for what is `seen`; the environment clips them to [-1, 1].
+
+    A learner that decides for `chunk` env steps at once gives the actions of all of them, one after another.
+    """
     return learners.act(section, state, seen, deterministic=not explore, key=key)
 
 
 def policy(section: ControllerConfig, task: Task, state: Any, *, key: Array) -> Policy:
-    """Its actions in states [..., state] under subgoals [..., m], without exploration."""
+    """Its actions in states [..., state] under subgoals [..., m], without exploration; of a chunk the first."""
 
     def actions(states: Array, subgoals: Array) -> Array:
-        return act(section, state, observe(section, task, states, subgoals), explore=False, key=key)
+        decided = act(section, state, observe(section, task, states, subgoals), explore=False, key=key)
+        return decided[..., : task.spec.action_size]
 
     return actions
 

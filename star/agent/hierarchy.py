@@ -3,7 +3,7 @@
 prepare   before a greedy episode: the Commander as it acts there, and its roadmap
 decide    every l env steps: the Commander's target where a period begins, and the Tutor's subgoal
 follow    after every env step: the subgoal moves with the agent
-act       at every env step: the Controller
+act       at every env step: the Controller, which may decide for some env steps at once
 onward    after a greedy segment of l env steps: the clocks move on
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from star.agent.decisions import Memory, Roadmap, Scene
@@ -78,11 +79,35 @@ def follow(
     return agent.task.subgoals.moved(subgoal, spec.pose(before), spec.pose(after))
 
 
+def no_plan(agent: Agent, bodies: int) -> Float[Array, "B chunk act"]:
+    """The plans of so many `bodies` before a segment."""
+    return jnp.zeros((bodies, agent.config.controller.settings.chunk, agent.task.spec.action_size))
+
+
 def act(
-    agent: Agent, state: TrainState, seen: Float[Array, "B seen"], *, explore: bool, key: Array
-) -> Float[Array, "B act"]:
-    """The Controller's actions."""
-    return agent.controller.act(agent.config.controller, state.controller, seen, explore=explore, key=key)
+    agent: Agent,
+    state: TrainState,
+    seen: Float[Array, "B seen"],
+    plan: Float[Array, "B chunk act"],
+    *,
+    number: Array | int,
+    explore: bool,
+    key: Array,
+) -> tuple[Float[Array, "B act"], Float[Array, "B chunk act"]]:
+    """The Controller's actions, and its plan after them, given that of the env step before.
+
+    A learner that decides for `chunk` env steps at once does so where `number`, that of the env step in its segment, is
+    a multiple of `chunk`. Its actions are then played whatever is `seen`.
+    """
+    chunk = agent.config.controller.settings.chunk
+
+    def decided() -> Array:
+        return agent.controller.act(agent.config.controller, state.controller, seen, explore=explore, key=key)
+
+    if chunk == 1:
+        return decided(), plan
+    plan = jax.lax.cond(number % chunk == 0, lambda: decided().reshape(plan.shape), lambda: plan)
+    return plan[:, 0], jnp.roll(plan, -1, axis=1)
 
 
 def onward(agent: Agent, roadmap: Roadmap, memory: Memory, obs: Float[Array, "B obs"]) -> Memory:

@@ -183,9 +183,9 @@ def rollout(
     """L env steps under one subgoal per environment. Environments that end stay as they are in the statistics."""
     length, box = agent.task.spec.episode_length, streams.memory.box
 
-    def step(carry: tuple, step_key: Array) -> tuple[tuple, tuple[dict[str, Any], dict[str, Array]]]:
-        before, subgoal, seen, alive, episode = carry
-        action = hierarchy.act(agent, state, seen, explore=explore, key=step_key)
+    def step(carry: tuple, inputs: tuple[Array, Array]) -> tuple[tuple, tuple[dict[str, Any], dict[str, Array]]]:
+        (before, subgoal, seen, plan, alive, episode), (number, step_key) = carry, inputs
+        action, plan = hierarchy.act(agent, state, seen, plan, number=number, explore=explore, key=step_key)
         recorded = record(before, subgoal, box, action) if record else None
         after = env.step(before, action)
         moved = hierarchy.follow(agent, subgoal, before.obs, after.obs)
@@ -202,12 +202,13 @@ def rollout(
         }
         seen = hierarchy.observe(agent, after.obs, moved)
         ends = {"obs": after.obs, "subgoal": moved, "seen": seen}
-        return (after, moved, seen, alive * (1 - after.done), episode.after(after, alive)), (steps, ends)
+        return (after, moved, seen, plan, alive * (1 - after.done), episode.after(after, alive)), (steps, ends)
 
     seen = hierarchy.observe(agent, streams.env.obs, choice.subgoal)
-    carry = (streams.env, choice.subgoal, seen, 1 - streams.env.done, streams.episode)
-    (env_state, _, _, _, episode), (steps, ends) = jax.lax.scan(
-        step, carry, jax.random.split(key, agent.config.tutor.period)
+    plan, numbers = hierarchy.no_plan(agent, len(seen)), jnp.arange(agent.config.tutor.period)
+    carry = (streams.env, choice.subgoal, seen, plan, 1 - streams.env.done, streams.episode)
+    (env_state, _, _, _, _, episode), (steps, ends) = jax.lax.scan(
+        step, carry, (numbers, jax.random.split(key, len(numbers)))
     )
     first = {"obs": streams.env.obs, "subgoal": choice.subgoal, "seen": seen}
     path: dict[str, Array] = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, ends)

@@ -11,7 +11,7 @@ from star.abstraction.sections import AbstractionConfig, ForwardModelConfig, Ref
 from star.config.run import EnvConfig, RunConfig, TrainerConfig
 from star.config.section import Batch, Hidden, Positive, Repeats, Section, setting
 from star.learners import Rollout
-from star.learners.sections import BUILT_IN, OF_PLACES, CRLConfig, LevelConfig, one_of
+from star.learners.sections import BUILT_IN, OF_PLACES, ChronoSRLConfig, CRLConfig, LevelConfig, one_of
 from star.sgim.sections import SgimConfig
 
 
@@ -147,6 +147,12 @@ class TutorConfig(LevelConfig):
         return self
 
     @model_validator(mode="after")
+    def _subgoals_are_chosen_one_by_one(self) -> Self:
+        if self.enabled and self.settings.chunk > 1:
+            raise ValueError(f"learner: {self.learner} decides for some env steps at once, which no Tutor can")
+        return self
+
+    @model_validator(mode="after")
     def _correction_needs_replay(self) -> Self:
         if self.off_policy_correction and not self.settings.replays:
             raise ValueError("off_policy_correction needs learner td3, which replays old subgoals")
@@ -160,6 +166,7 @@ class ControllerConfig(LevelConfig):
 
     learner: str = one_of(*built_in)
     crl: CRLConfig = Field(CRLConfig(), description="settings used when learner is crl")
+    chronosrl: ChronoSRLConfig = Field(ChronoSRLConfig(), description="settings used when learner is chronosrl")
     termination_penalty: float = setting(
         20.0, "This is taken off the reward where the task is terminated, as by a flip.", unit="", ge=0
     )
@@ -222,6 +229,12 @@ class Config(RunConfig):
         if self.commander.period % self.tutor.period:
             raise ValueError(
                 f"commander.period: {self.commander.period} is not a multiple of tutor.period {self.tutor.period}"
+            )
+        chunk = self.controller.settings.chunk
+        if self.tutor.period % chunk:
+            raise ValueError(
+                f"tutor.period: {self.tutor.period} is not a multiple of the {chunk} env steps "
+                f"for which controller.learner {self.controller.learner} decides at once"
             )
         return self
 

@@ -1,7 +1,7 @@
 """Learning of a level from its own transitions: PPO, TD3, or a learner of a user's own.
 
     name                     `learner` in the settings of a level
-    ppo, td3                 files in this folder, imported when they are first needed
+    ppo, td3, crl, chronosrl files in this folder, imported when they are first needed
     module:name              a `Learner` in a file of the user's own; its settings stand under `own`
 
 The levels know learners by the functions below alone.

@@ -12,6 +12,9 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float
 
+VARIANCE = 1 / 3  # of an initial weight, times the inputs of its layer, in JaxGCRL and ChronoSRL
+_LEAST = 1e-6
+
 
 class MLP(nn.Module):
     """Dense layers of the widths `hidden`, then a linear layer of width `out`.
@@ -40,9 +43,53 @@ class MLP(nn.Module):
         return dense(self.out, self.final_scale**2)(x)
 
 
-def apply(mlp: MLP, params: Any, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
+class ResidualMLP(nn.Module):
+    """A dense layer, `blocks` blocks of four more, and a linear layer of width `out`.
+
+    Each dense layer is followed by LayerNorm and swish. The input of a block is added to its output. Layers of blocks
+    are kept in arrays [blocks, 4, ...] of weights, biases, scales and shifts: any depth compiles like one layer.
+    """
+
+    width: int
+    blocks: int
+    out: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
+        """Apply the network to the last axis of `x`."""
+        x = nn.swish(nn.LayerNorm()(uniform_dense(self.width)(x)))
+        shape, zeros, ones = (self.blocks, 4, self.width), nn.initializers.zeros, nn.initializers.ones
+        kernel = nn.initializers.variance_scaling(VARIANCE, "fan_in", "uniform", batch_axis=(0, 1))
+        layers = (
+            self.param("kernel", kernel, (*shape, self.width)),
+            self.param("bias", zeros, shape),
+            self.param("scale", ones, shape),
+            self.param("shift", zeros, shape),
+        )
+
+        def layer(x: Array, params: tuple[Array, ...]) -> tuple[Array, None]:
+            kernel, bias, scale, shift = params
+            return nn.swish(scale * jax.nn.standardize(x @ kernel + bias, epsilon=1e-6) + shift), None
+
+        def block(x: Array, params: tuple[Array, ...]) -> tuple[Array, None]:
+            return x + jax.lax.scan(layer, x, params)[0], None
+
+        return uniform_dense(self.out, name="out")(jax.lax.scan(block, x, layers)[0])
+
+
+def uniform_dense(width: int, **more: Any) -> nn.Dense:
+    """A dense layer whose initial weights are uniform, of variance `VARIANCE` / n with n inputs."""
+    return nn.Dense(width, kernel_init=nn.initializers.variance_scaling(VARIANCE, "fan_in", "uniform"), **more)
+
+
+def apply(mlp: nn.Module, params: Any, x: Float[Array, "*batch n"]) -> Float[Array, "*batch out"]:
     """Output of `mlp` with `params` for the last axis of `x`."""
     return jnp.asarray(mlp.apply(params, x))
+
+
+def distance(x: Float[Array, "#*batch n"], y: Float[Array, "#*batch n"]) -> Float[Array, "..."]:
+    """||x - y|| of vectors along the last axis, with a slope everywhere; the other axes are broadcast."""
+    return jnp.sqrt(jnp.square(x - y).sum(axis=-1) + _LEAST)
 
 
 def descend(

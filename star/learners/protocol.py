@@ -34,6 +34,11 @@ class LearnerConfig(Section):
     futures: ClassVar[bool] = False
     """True if goals are drawn from the future. Then `extras` are a `Track`, and observations end in the goal."""
 
+    @property
+    def chunk(self) -> int:
+        """The number of env steps for which a Controller decides at once: `act` gives the actions of all of them."""
+        return 1
+
     def check(self, rollout: Rollout) -> None:
         """Raise ValueError in one line, beginning with the setting, if such rollouts cannot be learnt from."""
 
@@ -63,7 +68,10 @@ class Learner(NamedTuple):
     init: Callable[..., Any]
     """(key, config, *, example) -> state, for transitions shaped like `example`, without leading axes."""
     act: Callable[..., Any]
-    """(config, state, obs [..., obs], *, deterministic, key) -> actions [..., act], meaningful in [-1, 1]."""
+    """(config, state, obs [..., obs], *, deterministic, key) -> actions [..., chunk * act], meaningful in [-1, 1].
+
+    They are those of the next `config.chunk` env steps, one after another: for most learners of one.
+    """
     update: Callable[..., tuple[Any, dict[str, jax.Array]]]
     """(config, state, rollout, *, penalty, imitation, key) -> state, metrics.
 

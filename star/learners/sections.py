@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
 
@@ -14,7 +14,7 @@ from star.learners.protocol import Learner, LearnerConfig, Rollout
 
 NUMBER = 4  # bytes
 BUILT_IN = ("ppo", "td3")
-OF_PLACES = ("crl",)  # of a level that is sent to places
+OF_PLACES = ("crl", "chronosrl")  # of a level that is sent to places
 
 
 def one_of(*names: str) -> Any:
@@ -131,24 +131,10 @@ class TD3Config(BufferedConfig, LearnerConfig):
         return self.updates_per_rollout * self.batch_size / rollout.size
 
 
-class CRLConfig(BufferedConfig, LearnerConfig):
-    """Contrastive reinforcement learning (Eysenbach et al. 2022); defaults are JaxGCRL's."""
+class FuturesConfig(BufferedConfig, LearnerConfig):
+    """Settings of what learns which actions lead where, with goals to which the agent came later."""
 
-    hidden: Hidden = setting(
-        (256, 256), "Actor and both halves of the critic have layers of these widths.", unit="units"
-    )
-    representation: Positive = setting(64, "The halves of the critic meet in a space of this size.", unit="units")
     learning_rate: float = setting(3e-4, "Adam takes steps of this size.", unit="", gt=0)
-    discount: float = setting(
-        0.99,
-        "Goals lie so many env steps ahead: geometric, each step going on with this probability (gamma).",
-        unit="",
-        gt=0,
-        lt=1,
-    )
-    logsumexp_penalty: float = setting(
-        0.1, "The critic is kept near a probability by a penalty of this weight.", unit="", ge=0
-    )
     batch_size: Batch = setting(256, "Each update learns from so many transitions.", unit="transitions")
     buffer_size: Positive = setting(512_000, "The buffer keeps so many transitions.", unit="transitions")
     min_transitions: Positive = setting(1000, "The first update waits for so many transitions.", unit="transitions")
@@ -166,13 +152,74 @@ class CRLConfig(BufferedConfig, LearnerConfig):
         if self.buffer_size < self.min_transitions:
             raise ValueError(f"min_transitions: {self.min_transitions} exceeds buffer_size {self.buffer_size}")
 
+    def samples_per_transition(self, rollout: Rollout) -> float:
+        """Samples drawn after a rollout, for each transition in it."""
+        return self.updates_per_rollout * self.batch_size / rollout.size
+
+
+class CRLConfig(FuturesConfig):
+    """Contrastive reinforcement learning (Eysenbach et al. 2022); defaults are JaxGCRL's."""
+
+    hidden: Hidden = setting(
+        (256, 256), "Actor and both halves of the critic have layers of these widths.", unit="units"
+    )
+    representation: Positive = setting(64, "The halves of the critic meet in a space of this size.", unit="units")
+    discount: float = setting(
+        0.99,
+        "Goals lie so many env steps ahead: geometric, each step going on with this probability (gamma).",
+        unit="",
+        gt=0,
+        lt=1,
+    )
+    logsumexp_penalty: float = setting(
+        0.1, "The critic is kept near a probability by a penalty of this weight.", unit="", ge=0
+    )
+
     def scratch_bytes(self, rollout: Rollout) -> int:
         """Activations of a batch in the networks, and the energies of its pairs."""
         return self.batch_size * (sum(self.hidden) + self.batch_size) * NUMBER
 
-    def samples_per_transition(self, rollout: Rollout) -> float:
-        """Samples drawn after a rollout, for each transition in it."""
-        return self.updates_per_rollout * self.batch_size / rollout.size
+
+class ChronoSRLConfig(FuturesConfig):
+    """ChronoSRL (arXiv 2609.36238); defaults are the published ones."""
+
+    width: Annotated[int, Field(gt=0, le=2**14)] = setting(256, "Layers of all networks are so wide.", unit="units")
+    blocks: Annotated[int, Field(gt=0, le=64)] = setting(
+        2, "Each network has so many residual blocks of four layers.", unit="blocks"
+    )
+    representation: Positive = setting(64, "The halves of the critic meet in a space of this size.", unit="units")
+    action_chunk: Annotated[int, Field(gt=0, le=64)] = setting(
+        2, "The actor decides once in so many env steps, for all of them.", unit="env steps"
+    )
+    horizon: Annotated[int, Field(gt=1, le=10_000)] = setting(
+        1000, "The critic looks so far ahead; what comes later counts as never.", unit="env steps"
+    )
+    radius: float = setting(
+        0.5,
+        "Goals count as reached within this distance; it should be the task's radius of success.",
+        unit="units of the state",
+        gt=0,
+    )
+    discount: float = setting(
+        0.999, "An env step counts by this factor less for each one that it lies ahead (gamma).", unit="", gt=0, lt=1
+    )
+    goal_discount: float = setting(
+        0.99,
+        "Goals lie so many env steps ahead: geometric, each step going on with this probability.",
+        unit="",
+        gt=0,
+        lt=1,
+    )
+    batch_size: Batch = setting(512, "Each update learns from so many transitions.", unit="transitions")
+
+    @property
+    def chunk(self) -> int:
+        """The env steps of one decision."""
+        return self.action_chunk
+
+    def scratch_bytes(self, rollout: Rollout) -> int:
+        """Activations of a batch in the networks, the distances of its pairs, and the logits of hazards."""
+        return self.batch_size * (4 * self.width * (4 * self.blocks + 1) + self.batch_size + self.horizon) * NUMBER
 
 
 class LevelConfig(Section):

@@ -6,84 +6,39 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from star.config import loading
-from star.config.section import ConfigError
-from star.learners import crl, replay
-from star.learners.replay import Track, Transition
-
-ENVS, LENGTH = 4, 6  # of a rollout
+from star.learners import crl, futures, replay
+from star.learners.futures import Future, Step
+from tests.learners import places
+from tests.learners.places import CAPACITY, ENVS, EXAMPLE, LENGTH, SMALL, filled, rollout, slow_left
 
 
 def parsed(**values):
-    level = {
-        "learner": "crl",
-        "frame": "map",
-        "crl": {"buffer_size": 96, "batch_size": 16, "min_transitions": 24} | values,
-    }
-    small = {"trainer": {"num_envs": ENVS}, "tutor": {"enabled": False, "period": LENGTH}, "commander": {"period": 6}}
-    return loading.parse({"controller": level, **small})
+    return places.parsed("crl", SMALL | values)
 
 
 def settings(**values):
     return parsed(**values).controller.crl
 
 
-def rollout(rng, epoch):
-    """[LENGTH, ENVS] steps; some episodes end, and what follows in the rollout has no weight."""
-    shape = (LENGTH, ENVS)
-    ended = (rng.random(shape) < 0.1).astype(np.float32)
-    alive = np.concatenate([np.ones((1, ENVS)), np.cumprod(1 - ended, axis=0)[:-1]]).astype(np.float32)
-    numbers = lambda *more: rng.normal(size=(*shape, *more)).astype(np.float32)  # noqa: E731
-    track = Track(numbers(2), ended, np.full(shape, epoch, np.float32))
-    zero = np.zeros(shape, np.float32)
-    return Transition(numbers(5), numbers(2), zero, numbers(5), zero, zero, alive, extras=track)
-
-
-EXAMPLE = jax.tree.map(lambda x: jnp.asarray(x[0, 0]), rollout(np.random.default_rng(0), 0))
-
-
-def slow_left(steps):
-    """Steps that follow each of `steps`, a list of rows of environments in order of time."""
-    left = np.zeros((len(steps), ENVS), int)
-    for b in range(ENVS):
-        for t in range(len(steps)):
-            for now, after in zip(steps[t:], steps[t + 1 :], strict=False):
-                goes_on = now.weight[b] and not now.track.over[b] and after.weight[b]
-                if not goes_on or now.track.epoch[b] != after.track.epoch[b]:
-                    break
-                left[t, b] += 1
-    return left
-
-
 @pytest.mark.parametrize("rollouts", [1, 3, 4, 7])
 def test_goals_lie_ahead_in_the_same_episode_also_where_the_buffer_has_begun_anew(rollouts):
-    rng = np.random.default_rng(rollouts)
-    ring = replay.create(crl._step(EXAMPLE), size=4 * LENGTH * ENVS)
-    steps = []
-    for number in range(rollouts):
-        one = crl._step(rollout(rng, epoch=number // 2))
-        ring = replay.add(ring, replay.flatten(one))
-        steps += [jax.tree.map(lambda x, t=t: x[t], one) for t in range(LENGTH)]
+    ring, steps = filled(np.random.default_rng(rollouts), Step.of, rollouts)
     kept = steps[-4 * LENGTH :]
-    found = np.asarray(crl.steps_left(ring, num_envs=ENVS)).reshape(-1, ENVS)
+    found = np.asarray(futures.steps_left(ring, num_envs=ENVS)).reshape(-1, ENVS)
     first = len(steps) % (4 * LENGTH) if len(steps) > len(kept) else 0
     np.testing.assert_array_equal(np.roll(found, -first, axis=0)[: len(kept)], slow_left(kept))
     assert not found[len(kept) :].any() and found.max() > 2
 
 
 def test_it_draws_every_step_that_another_follows_and_its_goal_from_the_steps_that_follow():
-    rng, chosen = np.random.default_rng(5), settings(batch_size=96)
-    ring, steps = replay.create(crl._step(EXAMPLE), size=4 * LENGTH * ENVS), []
-    for number in range(3):  # a quarter of the buffer stays empty
-        one = crl._step(rollout(rng, epoch=number // 2))
-        ring = replay.add(ring, replay.flatten(one))
-        steps += [jax.tree.map(lambda x, t=t: x[t], one) for t in range(LENGTH)]
+    chosen = settings(batch_size=96)
+    ring, steps = filled(np.random.default_rng(5), Step.of, 3)  # a quarter of the buffer stays empty
     left = slow_left(steps)
     goals = {  # of each step, which its first number tells, the places that it may be sent to
         float(steps[t].obs[b, 0]): {tuple(steps[t + n].track.place[b]) for n in range(1, left[t, b] + 1)}
         for t, b in np.argwhere(left)
     }
-    draw = jax.jit(lambda key: crl._drawn(chosen, ring, crl.Future.of(ring, num_envs=ENVS), key))
+    draw = jax.jit(lambda key: crl._drawn(chosen, ring, Future.of(ring, num_envs=ENVS), key))
     seen = set()
     for number in range(10):
         batch, goal = draw(jax.random.key(number))
@@ -95,8 +50,8 @@ def test_it_draws_every_step_that_another_follows_and_its_goal_from_the_steps_th
 
 
 def test_a_buffer_in_which_nothing_follows_gives_a_batch_without_weight():
-    ring = replay.create(crl._step(EXAMPLE), size=4 * LENGTH * ENVS)
-    future = crl.Future.of(ring, num_envs=ENVS)
+    ring = replay.create(Step.of(EXAMPLE), size=CAPACITY)
+    future = Future.of(ring, num_envs=ENVS)
     assert not crl._drawn(settings(), ring, future, jax.random.key(0))[0].weight.any()
 
 
@@ -112,10 +67,10 @@ def test_networks_begin_with_weights_as_small_as_those_of_jaxgcrl():
 
 def test_how_far_goals_lie_ahead_is_geometric_and_cut_off_at_the_end():
     uniform = jax.random.uniform(jax.random.key(0), (20_000,))
-    drawn = np.asarray(crl.ahead(jnp.full(uniform.shape, 5), uniform, discount=0.8))
+    drawn = np.asarray(futures.ahead(jnp.full(uniform.shape, 5), uniform, discount=0.8))
     wanted = 0.8 ** np.arange(5)
     assert stats.chisquare(np.bincount(drawn, minlength=6)[1:], len(drawn) * wanted / wanted.sum()).pvalue > 1e-4
-    assert np.asarray(crl.ahead(jnp.zeros(3, int), uniform[:3], discount=0.8)).tolist() == [0, 0, 0]
+    assert np.asarray(futures.ahead(jnp.zeros(3, int), uniform[:3], discount=0.8)).tolist() == [0, 0, 0]
 
 
 def slow_mlp(params, x):
@@ -129,7 +84,7 @@ def slow_mlp(params, x):
 def test_the_critic_tells_its_own_goal_from_those_of_others():
     chosen = settings(hidden=[8], representation=3, logsumexp_penalty=0.2)
     state, rng = crl.init(jax.random.key(1), chosen, example=EXAMPLE), np.random.default_rng(2)
-    batch = jax.tree.map(lambda x: jnp.asarray(x[:, 0]), crl._step(rollout(rng, 0)))
+    batch = jax.tree.map(lambda x: jnp.asarray(x[:, 0]), Step.of(rollout(rng, 0)))
     batch = batch.replace(weight=jnp.asarray([1.0, 1, 0, 1, 1, 1]))
     goal = rng.normal(size=(LENGTH, 2)).astype(np.float32)
     critic, obs = state.params["critic"], np.float64(batch.obs)
@@ -144,35 +99,10 @@ def test_the_critic_tells_its_own_goal_from_those_of_others():
 
 
 def test_it_learns_to_go_to_goals_that_no_reward_tells_of():
-    """A point in the plane moves by a fifth of its action, plus noise; the state is its place, seen twice."""
     chosen = settings(
         hidden=[32], batch_size=128, buffer_size=1536, updates_per_rollout=40, learning_rate=3e-3, discount=0.8
     )
-
-    def walk(place, key):
-        move = 0.2 * jax.random.uniform(key, place.shape, minval=-1, maxval=1)
-        return place + move, (place, 5 * move)
-
-    @jax.jit
-    def learn(state, key):
-        begin, walk_key, key = jax.random.split(key, 3)
-        start = jax.random.uniform(begin, (64, 2), minval=-1, maxval=1)
-        _, (place, action) = jax.lax.scan(walk, start, jax.random.split(walk_key, 24))
-        seen = jnp.concatenate([place, place[..., :1], 0 * place], axis=-1)
-        zero = jnp.zeros(place.shape[:2])
-        track = Track(place, zero, zero + jax.random.uniform(key))
-        one = Transition(seen, action, zero, seen, zero, zero, zero + 1, extras=track)
-        return crl.update(chosen, state, one, key=key)[0]
-
-    state = crl.init(jax.random.key(0), chosen, example=EXAMPLE)
-    for number in range(12):
-        state = learn(state, jax.random.key(number))
-    place, goal = np.random.default_rng(0).uniform(-1, 1, (2, 200, 2)).astype(np.float32)
-    seen = np.concatenate([place, place[:, :1], goal], axis=1)
-    action = np.asarray(crl.act(chosen, state, seen, deterministic=True, key=jax.random.key(0)))
-    way = goal - place
-    cosine = (action * way).sum(1) / (np.linalg.norm(action, axis=1) * np.linalg.norm(way, axis=1))
-    assert np.median(cosine) > 0.9
+    assert np.median(places.cosines(crl, chosen, rollouts=9)) > 0.9
 
 
 @pytest.mark.parametrize(
@@ -188,10 +118,4 @@ def test_it_learns_to_go_to_goals_that_no_reward_tells_of():
     ],
 )
 def test_what_does_not_fit_is_told_in_one_line(level, message):
-    values = parsed().model_dump(mode="json")
-    for section, changed in level.items():
-        for key, value in changed.items():
-            values[section][key] = values[section][key] | value if isinstance(value, dict) else value
-    with pytest.raises(ConfigError, match=message.replace(".", r"\.")) as caught:
-        loading.parse(values)
-    assert "\n" not in str(caught.value)
+    assert message in places.refused(parsed(), level)

@@ -78,7 +78,7 @@ def test_it_trains_checkpoints_and_resumes_bit_for_bit(here, monkeypatch, capsys
         (["--controller.learner", "mine:Config"], "is a class; allowed: a star.learners.protocol.Learner"),
         (
             ["--controller.learner", "mine.it"],
-            "'mine.it' is not allowed: should be 'ppo', 'td3', 'crl' or 'module:name'",
+            "'mine.it' is not allowed: should be 'ppo', 'td3', 'crl', 'chronosrl' or 'module:name'",
         ),
         (["--controller.learner", "nobody:has"], "cannot be imported: ModuleNotFoundError: No module named 'nobody'"),
         (["--controller.learner", "ppo", "--controller.own.std", "1"], "controller.own: 'std' is no setting of ppo"),
