@@ -15,7 +15,7 @@ os.environ.setdefault(
     + " --xla_cpu_use_fusion_emitters=false" * version("jax").startswith("0.10."),
 )
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")  # nine of ten programs take less than 0.2
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")  # to keep smaller ones costs more
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # nobody reads where in our code an operation comes from
 
 from dataclasses import replace  # noqa: E402

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import re
 import stat
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +51,12 @@ def plain(text: str) -> Any:
     Raises:
       yaml.YAMLError: also for a key given twice, and for what is nested too deep or grows too large by its aliases.
     """
+    return copy.deepcopy(_plain(text))
+
+
+@lru_cache(maxsize=64)
+def _plain(text: str) -> Any:
+    """As `plain`; a command reads the file of a run several times."""
     try:
         return yaml.load(text, _Plain)  # noqa: S506 - a SafeLoader
     except yaml.YAMLError:

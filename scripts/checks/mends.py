@@ -67,8 +67,8 @@ MENDS = (
         "intervals over seeds are too narrow",
         "tests/report/test_statistics.py::test_of_normal_seeds_intervals_hold_the_truth_as_often_as_they_say",
         "star/report/statistics.py",
-        "scipy.stats.t.ppf(0.975, np.maximum(freedom, 1.0)) * np.sqrt(variance)",
-        "1.96 * np.sqrt(variance)",
+        "half = quantile * np.sqrt(variance)",
+        "half = 1.96 * np.sqrt(variance)",
     ),
     Mend(
         "seeds that agree give an interval of width 0",
