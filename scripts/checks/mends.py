@@ -205,7 +205,7 @@ MENDS = (
     ),
     Mend(
         "python -m star is unknown",
-        _use("printed_commands_can_be_typed"),
+        "tests/cli/test_cli.py::test_the_program_itself_prints_help_and_no_warnings",
         "star/__main__.py",
         "    sys.exit(main())",
         "    pass",
