@@ -51,11 +51,11 @@ def plain(text: str) -> Any:
     Raises:
       yaml.YAMLError: also for a key given twice, and for what is nested too deep or grows too large by its aliases.
     """
-    return copy.deepcopy(_plain(text))
+    return copy.deepcopy(_parsed(text))
 
 
 @lru_cache(maxsize=64)
-def _plain(text: str) -> Any:
+def _parsed(text: str) -> Any:
     """As `plain`; a command reads the file of a run several times."""
     try:
         return yaml.load(text, _Plain)  # noqa: S506 - a SafeLoader

@@ -80,7 +80,25 @@ class BufferedConfig(Section):
         return self
 
 
-class TD3Config(BufferedConfig, LearnerConfig):
+class ReplayConfig(BufferedConfig, LearnerConfig):
+    """Settings of a learner that keeps transitions and learns from them again and again."""
+
+    min_transitions: Positive = setting(1000, "The first update waits for so many transitions.", unit="transitions")
+    updates_per_rollout: Repeats = setting(10, "Each rollout is followed by so many gradient updates.", unit="updates")
+
+    replays: ClassVar[bool] = True
+
+    def check(self, rollout: Rollout) -> None:
+        """The buffer holds what updates wait for."""
+        if self.buffer_size < self.min_transitions:
+            raise ValueError(f"min_transitions: {self.min_transitions} exceeds buffer_size {self.buffer_size}")
+
+    def samples_per_transition(self, rollout: Rollout) -> float:
+        """Samples drawn after a rollout, for each transition in it."""
+        return self.updates_per_rollout * self.batch_size / rollout.size
+
+
+class TD3Config(ReplayConfig):
     """Twin delayed deep deterministic policy gradient (Fujimoto et al. 2018), as published for STAR."""
 
     hidden: Hidden = setting((300, 300), "Actor and critics have layers of these widths.", unit="units")
@@ -99,7 +117,6 @@ class TD3Config(BufferedConfig, LearnerConfig):
     min_transitions: Positive = setting(
         1000, "The first update waits for so many transitions of random actions.", unit="transitions"
     )
-    updates_per_rollout: Repeats = setting(10, "Each rollout is followed by so many gradient updates.", unit="updates")
     policy_delay: Positive = setting(2, "The actor is updated once in so many updates of the critics.", unit="updates")
     target_noise: float = setting(
         0.2, "Target actions in [-1, 1] are smoothed by noise of this standard deviation.", unit="", ge=0
@@ -109,14 +126,11 @@ class TD3Config(BufferedConfig, LearnerConfig):
         0.1, "Actions in [-1, 1] are explored with noise of this standard deviation.", unit="", ge=0
     )
 
-    replays: ClassVar[bool] = True
-
     def check(self, rollout: Rollout) -> None:
         """The buffer holds a rollout, and what updates wait for; it is cut into equal shares for devices."""
         if self.buffer_size < rollout.size:
             raise ValueError(f"buffer_size: {self.buffer_size} is below one rollout of {rollout.size}")
-        if self.buffer_size < self.min_transitions:
-            raise ValueError(f"min_transitions: {self.min_transitions} exceeds buffer_size {self.buffer_size}")
+        super().check(rollout)
         if self.buffer_size % rollout.devices:
             raise ValueError(
                 f"buffer_size: {self.buffer_size} cannot be shared evenly by trainer.devices {rollout.devices}"
@@ -126,21 +140,15 @@ class TD3Config(BufferedConfig, LearnerConfig):
         """Memory of networks for a batch."""
         return self.batch_size * sum(self.hidden) * NUMBER
 
-    def samples_per_transition(self, rollout: Rollout) -> float:
-        """Samples drawn after a rollout, for each transition in it."""
-        return self.updates_per_rollout * self.batch_size / rollout.size
 
-
-class FuturesConfig(BufferedConfig, LearnerConfig):
+class FuturesConfig(ReplayConfig):
     """Settings of what learns which actions lead where, with goals to which the agent came later."""
 
+    representation: Positive = setting(64, "The halves of the critic meet in a space of this size.", unit="units")
     learning_rate: float = setting(3e-4, "Adam takes steps of this size.", unit="", gt=0)
     batch_size: Batch = setting(256, "Each update learns from so many transitions.", unit="transitions")
     buffer_size: Positive = setting(512_000, "The buffer keeps so many transitions.", unit="transitions")
-    min_transitions: Positive = setting(1000, "The first update waits for so many transitions.", unit="transitions")
-    updates_per_rollout: Repeats = setting(10, "Each rollout is followed by so many gradient updates.", unit="updates")
 
-    replays: ClassVar[bool] = True
     futures: ClassVar[bool] = True
 
     def check(self, rollout: Rollout) -> None:
@@ -149,12 +157,7 @@ class FuturesConfig(BufferedConfig, LearnerConfig):
             raise ValueError(
                 f"buffer_size: {self.buffer_size} is not a multiple of one rollout of {rollout.size} transitions"
             )
-        if self.buffer_size < self.min_transitions:
-            raise ValueError(f"min_transitions: {self.min_transitions} exceeds buffer_size {self.buffer_size}")
-
-    def samples_per_transition(self, rollout: Rollout) -> float:
-        """Samples drawn after a rollout, for each transition in it."""
-        return self.updates_per_rollout * self.batch_size / rollout.size
+        super().check(rollout)
 
 
 class CRLConfig(FuturesConfig):
@@ -163,7 +166,6 @@ class CRLConfig(FuturesConfig):
     hidden: Hidden = setting(
         (256, 256), "Actor and both halves of the critic have layers of these widths.", unit="units"
     )
-    representation: Positive = setting(64, "The halves of the critic meet in a space of this size.", unit="units")
     discount: float = setting(
         0.99,
         "Goals lie so many env steps ahead: geometric, each step going on with this probability (gamma).",
@@ -187,7 +189,6 @@ class ChronoSRLConfig(FuturesConfig):
     blocks: Annotated[int, Field(gt=0, le=64)] = setting(
         2, "Each network has so many residual blocks of four layers.", unit="blocks"
     )
-    representation: Positive = setting(64, "The halves of the critic meet in a space of this size.", unit="units")
     action_chunk: Annotated[int, Field(gt=0, le=64)] = setting(
         2, "The actor decides once in so many env steps, for all of them.", unit="env steps"
     )
