@@ -147,7 +147,6 @@ ROWS: dict[str, Row] = {
     "agents/hiro": Row(),
     "agents/hrac": Row(settings=POINT | SMALL_TD3 | ADJACENCY),
     "ablations/grid": Row(),
-    "ablations/no_doubts": Row(),
     "ablations/no_heading": Row("ant_maze_cam", ANT),
     "ablations/no_mask": Row(),
     "ablations/no_passages": Row(),

@@ -47,11 +47,10 @@ class _Functions(NamedTuple):
     begin: Callable[..., tuple[TrainState, Roadmap, Memory, Array]]
     decide: Callable[..., tuple[Memory, Array, Array, Array]]
     go_on: Callable[..., tuple[Array, Array, Array]]
-    onward: Callable[..., Memory]
 
     @classmethod
     def of(cls, spec: Spec) -> _Functions:
-        return cls(*(jax.jit(partial(function, spec)) for function in (_begin, _decide, _go_on, _onward)))
+        return cls(*(jax.jit(partial(function, spec)) for function in (_begin, _decide, _go_on)))
 
 
 @dataclass
@@ -113,8 +112,7 @@ class TrainedAgent:
     def reset(self, seed: int = 0) -> None:
         """Begin an episode with the next observation.
 
-        `seed` is the `--evaluation-seed` of `star evaluate`: it decides between commands of equal worth, and where the
-        Tutor goes after a command that was in vain.
+        `seed` is the `--evaluation-seed` of `star evaluate`: it decides between commands of equal worth.
         """
         keys = self._program.evaluation_keys(seed, stream=programs.AFTERWARDS)
         self._key, self._episode = keys[self._program.seeds.index(self.seed)], None
@@ -136,8 +134,6 @@ class TrainedAgent:
         segment, within = divmod(episode.steps, self.config.tutor.period)
         hyper, functions = self._program.hyper, self._functions
         if within == 0:
-            if segment:
-                episode.memory = functions.onward(hyper, episode.roadmap, episode.memory, batch)
             episode.memory, episode.subgoal, action, episode.plan = functions.decide(
                 hyper, episode.state, episode.roadmap, episode.memory, batch, episode.keys[segment]
             )
@@ -222,7 +218,7 @@ def _begin(
     """The state as it acts, its roadmap, the memory at the start, and the keys of all segments."""
     agent, segments = levels.of(config, spec, greedy=True), spec.episode_length // config.tutor.period
     begin_key, keys = hierarchy.segment_keys(key, segments)
-    memory = agent.commander.begin(config.commander, spec.abstract(obs), decisions=segments, key=begin_key)
+    memory = agent.commander.begin(config.commander, spec.abstract(obs), greedy=True, key=begin_key)
     return *hierarchy.prepare(agent, state), memory, keys
 
 
@@ -235,11 +231,12 @@ def _decide(
     obs: Float[Array, "B n"],
     keys: Float[Array, "3"],
 ) -> tuple[Memory, Array, Array, Array]:
-    """The first env step of a segment: memory, subgoal, action, and the Controller's plan."""
+    """The first env step of a segment: memory for the next one, subgoal, action, and the Controller's plan."""
     agent = levels.of(config, spec, greedy=True)
     memory, _, _, choice = hierarchy.decide(
         agent, state, roadmap, memory, (), obs, spec.success(obs), env_steps=None, keys=(keys[0], keys[1], keys[2])
     )
+    memory = agent.commander.tick(config.commander, memory, steps=config.tutor.period)
     seen, plan = hierarchy.observe(agent, obs, choice.subgoal), hierarchy.no_plan(agent, len(obs))
     return memory, choice.subgoal, *hierarchy.act(agent, state, seen, plan, number=0, explore=False, key=keys[2])
 
@@ -259,11 +256,6 @@ def _go_on(
     subgoal = hierarchy.follow(agent, subgoal, before, obs)
     seen = hierarchy.observe(agent, obs, subgoal)
     return subgoal, *hierarchy.act(agent, state, seen, plan, number=number, explore=False, key=state.key)
-
-
-def _onward(spec: Spec, config: AgentConfig, roadmap: Roadmap, memory: Memory, obs: Array) -> Memory:
-    """The memory after a segment."""
-    return hierarchy.onward(levels.of(config, spec, greedy=True), roadmap, memory, obs)
 
 
 def _exported(spec: Spec, config: AgentConfig, state: TrainState) -> bytearray:

@@ -10,9 +10,7 @@
 A share of the environments practises: they pursue random regions instead of the goal. Goals hard to reach, and so
 unattractive to all others, are tried there.
 
-Greedy episodes explore nothing, remember which commands led back or nowhere, and decide again as soon as a target is
-reached. After a command in vain the Tutor draws its subgoals as in training, for what it would choose again is known
-to lead nowhere.
+Greedy episodes explore nothing, and follow a plan of their own (`settle`).
 
 Source: STAR (ICLR 2024), section 4.1.
 """
@@ -24,7 +22,7 @@ from types import ModuleType
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from envs.common.batching import where
 from star.abstraction import regions
@@ -71,14 +69,11 @@ def spread(section: CommanderConfig, share: Float[Array, ""], *, num_envs: int) 
     return share + section.epsilon_spread * even * jnp.minimum(share, 1 - share)
 
 
-def begin(section: CommanderConfig, position: Float[Array, "B d"], *, decisions: int | None, key: Array) -> Memory:
-    """Clocks at 0, in a share `practice` of the environments to practise.
-
-    In greedy episodes, of so many `decisions` at most, nobody practises.
-    """
+def begin(section: CommanderConfig, position: Float[Array, "B d"], *, greedy: bool, key: Array) -> Memory:
+    """Clocks at 0, in a share `practice` of the environments to practise; in `greedy` episodes nobody does."""
     memory = blank(position)
-    if decisions is not None:
-        return memory.replace(past=jnp.full((len(position), decisions, 3), -1))
+    if greedy:
+        return memory
     practising = jax.random.uniform(key, (len(position),)) < section.practice
     return memory.replace(practice=jnp.where(practising, ANY, -1))
 
@@ -117,10 +112,6 @@ def command(
     act_key, practice_key = jax.random.split(key)
     another = jax.random.randint(practice_key, memory.practice.shape, 0, roadmap.abstraction.count)
     practice = jnp.where((memory.practice == region) | (memory.practice == ANY), another, memory.practice)
-    past, worth = memory.past, None
-    if past is not None:
-        past = _remembered(memory, past, region, scene.success)
-        worth = _worth_by_now(section, state, past, region, goal_region)
     target = values.choose(
         state,
         roadmap.allowed,
@@ -128,7 +119,6 @@ def command(
         goal_region,
         practised=practice,
         attraction=roadmap.attraction,
-        worth=worth,
         epsilon=_shares(section, env_steps, num_envs=len(region)),
         key=act_key,
     )
@@ -149,7 +139,6 @@ def command(
         start=scene.position,
         reward=jnp.full_like(memory.reward, start_reward(section)),
         aside=aside,
-        past=past,
     )
     return where(memory.clock == 0, fresh, memory)
 
@@ -159,36 +148,6 @@ def _shares(
 ) -> Float[Array, "B"] | float:
     """Share of random choices of each environment; none in greedy episodes."""
     return 0.0 if env_steps is None else spread(section, epsilon(section, env_steps), num_envs=num_envs)
-
-
-def _remembered(
-    memory: Memory, past: Int[Array, "B N 3"], region: Int[Array, "B"], success: Float[Array, "B"]
-) -> Int[Array, "B N 3"]:
-    """`past` with the last decision, unless the agent stays where it succeeds."""
-    left = region != memory.region
-    last = jnp.stack([memory.region, memory.target, left.astype(past.dtype)], axis=-1)
-    return where(left | (success == 0), jnp.concatenate([past[:, 1:], last[:, None]], axis=1), past)
-
-
-def _worth_by_now(
-    section: CommanderConfig,
-    state: CommanderState,
-    past: Int[Array, "B N 3"],
-    region: Int[Array, "B"],
-    goal_region: Int[Array, "B"],
-) -> Float[Array, "B R"]:
-    """The rest of the value of each command in `region`, from 0 to 1, after what it did in this episode.
-
-    Where it led out, that was in vain, as the agent is there again: `retry` for each time. Where it did not, that was
-    bad luck, of a known chance s each time, or the command does not work from here. With `trust` = h, the chance that
-    it does after n times, over h, is s^n / (h s^n + 1 - h) (Bayes).
-    """
-    again = past[..., 0] == region[:, None]
-    commanded = jax.nn.one_hot(past[..., 1], len(state.chosen)) * again[..., None]
-    led_out = past[..., 2:] == 1
-    left, stayed = (commanded * led_out).sum(axis=1), (commanded * ~led_out).sum(axis=1)
-    luck = jnp.maximum(_rule(section).staying(section, state, region, goal_region) ** stayed, 1e-30)
-    return section.retry**left * luck / (section.trust * luck + (1 - section.trust))
 
 
 def experience(
@@ -230,24 +189,6 @@ def tick(section: CommanderConfig, memory: Memory, *, steps: int) -> Memory:
 def renewed(memory: Memory) -> Bool[Array, "B"]:
     """True where another target follows."""
     return memory.clock == 0
-
-
-def in_vain(memory: Memory, success: Float[Array, "B"]) -> Bool[Array, "B"]:
-    """True where the last command of a greedy episode led neither out of the region nor to the goal."""
-    if memory.past is None:
-        return jnp.zeros(len(success), bool)
-    return (memory.past[:, -1, 0] == memory.region) & (memory.past[:, -1, 2] == 0) & (success == 0)
-
-
-def ahead_of_time(section: CommanderConfig, roadmap: Roadmap, memory: Memory, position: Float[Array, "B d"]) -> Memory:
-    """With `arrival`, clocks at 0 where the target region is reached, unless the goal is aimed at in it.
-
-    For greedy episodes alone: the forward model learns where whole periods lead.
-    """
-    if not section.arrival:
-        return memory
-    arrived = (regions.locate(roadmap.abstraction, position) == memory.target) & (memory.target != memory.goal_region)
-    return memory.replace(clock=jnp.where(arrived, 0, memory.clock))
 
 
 def observe(

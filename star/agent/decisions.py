@@ -38,8 +38,6 @@ class Memory(struct.PyTreeNode):
     reward: Float[Array, "B"]
     aside: Bool[Array, "B"]
     """True if the box is that around a waypoint, not the target region or the goal's."""
-    past: Int[Array, "B N 3"] | None = None
-    """In greedy episodes the last decisions: region, target, and 1 where the region was left, else 0; -1 before."""
 
 
 class Decision(struct.PyTreeNode):

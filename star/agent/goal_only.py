@@ -15,7 +15,7 @@ from star.agent.sections import CommanderConfig
 from star.agent.segments import Segment
 from star.agent.task import Task
 
-__all__ = ["ahead_of_time", "begin", "command", "experience", "in_vain", "init", "observe", "renewed", "settle", "tick"]
+__all__ = ["begin", "command", "experience", "init", "observe", "renewed", "settle", "tick"]
 
 
 def begin(section: CommanderConfig, position: Float[Array, "B d"], *_: Any, **__: Any) -> Memory:
@@ -50,16 +50,6 @@ def experience(
 def renewed(memory: Memory) -> Bool[Array, "B"]:
     """Nowhere does another target follow before the episode ends."""
     return jnp.zeros(len(memory.clock), bool)
-
-
-def ahead_of_time(section: CommanderConfig, roadmap: Roadmap, memory: Memory, *_: Any) -> Memory:
-    """There is no target to arrive at before the goal."""
-    return memory
-
-
-def in_vain(memory: Memory, success: Float[Array, "B"]) -> Bool[Array, "B"]:
-    """Nowhere: there is one command alone."""
-    return jnp.zeros(len(success), bool)
 
 
 def observe(section: CommanderConfig, state: Any, *_: Any, **__: Any) -> Any:

@@ -4,7 +4,6 @@ prepare   before a greedy episode: the Commander as it acts there, and its roadm
 decide    every l env steps: the Commander's target where a period begins, and the Tutor's subgoal
 follow    after every env step: the subgoal moves with the agent
 act       at every env step: the Controller, which may decide for some env steps at once
-onward    after a greedy segment of l env steps: the clocks move on
 """
 
 from __future__ import annotations
@@ -61,8 +60,8 @@ def decide(
     memory = agent.commander.command(
         config.commander, task, state.commander, roadmap, memory, scene, marks, env_steps=env_steps, key=keys[0]
     )
-    draw = (env_steps is not None) | agent.commander.in_vain(memory, success)
-    choice = agent.tutor.act(config.tutor, task, state.tutor, obs, memory.box, marks, draw=draw, key=keys[1])
+    explore = env_steps is not None
+    choice = agent.tutor.act(config.tutor, task, state.tutor, obs, memory.box, marks, explore=explore, key=keys[1])
     return memory, lesson, marks, choice
 
 
@@ -108,10 +107,3 @@ def act(
         return decided(), plan
     plan = jax.lax.cond(number % chunk == 0, lambda: decided().reshape(plan.shape), lambda: plan)
     return plan[:, 0], jnp.roll(plan, -1, axis=1)
-
-
-def onward(agent: Agent, roadmap: Roadmap, memory: Memory, obs: Float[Array, "B obs"]) -> Memory:
-    """The Commander's memory after a greedy segment that ended in `obs`."""
-    section = agent.config.commander
-    memory = agent.commander.tick(section, memory, steps=agent.config.tutor.period)
-    return agent.commander.ahead_of_time(section, roadmap, memory, agent.task.spec.abstract(obs))

@@ -46,7 +46,8 @@ STAR = Kind(
     format=FORMAT,
     migrations=TO_NEXT,
     harmless=("env.engine",),
-    older={"tutor.straight": False, "commander.trust": 1.0, "refinement.separate": False},
+    older={"tutor.straight": False, "refinement.separate": False},
+    gone=("commander.arrival", "commander.retry", "commander.trust"),
     anywhere={"env.engine": "auto"},
     commands={
         "evaluate": lazily("star.agent.commands:evaluate"),

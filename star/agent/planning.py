@@ -33,7 +33,6 @@ from star.agent.sections import CommanderConfig
 from star.agent.values import CommanderState, Model, best
 
 _HUNCH = 0.1  # what belief is worth where nothing is to be tried
-_HABIT = 0.1  # share by which a command that nobody follows has to be better than the usual one
 _KEPT = 20.0  # decisions of a command that do not fade, since rare ones would be forgotten before they are enough
 
 
@@ -82,36 +81,14 @@ def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *,
     """The Commander for greedy episodes of so many `periods`, with Q by what commands have led to.
 
     The belief that what was not tried succeeds makes agents try it, which is of no use where nothing is learnt: here it
-    only decides among what is unknown, and none of it is left over, as this plan begins from nothing. Of commands that
-    look about as good the usual one is better known: regions are coarse, and what leads on where agents stood when they
-    tried it may lead nowhere from where they enter. So what was chosen less often is worth a little less. Q stays as it
-    is with rewards by distance, of which nothing is the best.
+    only decides among what is unknown, and none of it is left over, as this plan begins from nothing. Q stays as it is
+    with rewards by distance, of which nothing is the best.
     """
     if section.reward != "success":
         return state
     chances, reward = _expectations(section, _model(state), roadmap.believed, belief=_HUNCH)
     q = _iterated(section, roadmap.allowed, jnp.zeros_like(state.q)[None], reward[None], chances, sweeps=periods)[0]
-    visits = _model(state).visits
-    usual = visits / jnp.maximum(visits.max(axis=-1, keepdims=True), 1.0)
-    return state.replace(q=q * (1 - _HABIT * (1 - usual)))
-
-
-def staying(
-    section: CommanderConfig, state: CommanderState, region: Int[Array, "B"], goal_region: Int[Array, "B"]
-) -> Float[Array, "B R"]:
-    """Chance that a command does not lead out of `region`, and of the goal in it, that it is not reached.
-
-    By what was counted, and `section.prior` decisions of which half do not.
-    """
-    model, each = _model(state), jnp.arange(len(region))
-    led, lost = model.led[:, region], model.lost[:, region]
-    stays = led[:, each, :, region].swapaxes(0, 1)
-    to_region, to_goal = (stays + section.prior / 2) / (led.sum(axis=-1) + lost + section.prior)
-    targets = jnp.arange(to_region.shape[-1])
-    reward = model.rewards[region, goal_region] + section.prior / 2
-    missed = jnp.clip(1 - reward / (model.visits[region, goal_region] + section.prior), 0.0, 1.0)
-    at_goal = targets == goal_region[:, None]
-    return jnp.where(at_goal, jnp.where(targets == region[:, None], missed, to_goal), to_region)
+    return state.replace(q=q)
 
 
 def fade(section: CommanderConfig, state: CommanderState) -> Model:

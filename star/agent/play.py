@@ -104,14 +104,14 @@ def greedy(
     agent = levels.of(config, spec, greedy=True)
     segments = spec.episode_length // config.tutor.period
     reset_key, keys = hierarchy.segment_keys(key, segments)
-    streams = start(agent, env, goals=goals, decisions=segments, key=reset_key)
+    streams = start(agent, env, goals=goals, greedy=True, key=reset_key)
     state, roadmap = hierarchy.prepare(agent, state)
 
     def one(streams: Streams, keys: Array) -> tuple[Streams, Any]:
         streams, passed, _ = segment(
             agent, env, state, roadmap, streams, env_steps=None, record=record, keys=(keys[0], keys[1], keys[2])
         )
-        memory = hierarchy.onward(agent, roadmap, streams.memory, passed.obs[-1])
+        memory = agent.commander.tick(config.commander, streams.memory, steps=config.tutor.period)
         return streams.replace(memory=memory), passed.recorded
 
     streams, recorded = jax.lax.scan(one, streams, keys)
@@ -123,16 +123,16 @@ def start(
     env: VectorEnv,
     *,
     goals: Float[Array, "B k"] | None = None,
-    decisions: int | None = None,
+    greedy: bool = False,
     key: Array,
 ) -> Streams:
-    """Fresh environments with their clocks at 0, with `goals` if given; greedy ones make so many `decisions`."""
+    """Fresh environments with their clocks at 0, with `goals` if given; for training, or for `greedy` episodes."""
     reset_key, practice_key = jax.random.split(key)
     env_state = env.reset(reset_key)
     if goals is not None:
         env_state = env.with_goals(env_state, goals, jnp.ones(env.num_envs, bool))
     position = agent.task.spec.abstract(env_state.obs)
-    memory = agent.commander.begin(agent.config.commander, position, decisions=decisions, key=practice_key)
+    memory = agent.commander.begin(agent.config.commander, position, greedy=greedy, key=practice_key)
     return Streams(env=env_state, memory=memory, lesson=(), episode=Episode.start(env_state.metrics["distance"]))
 
 

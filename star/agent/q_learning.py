@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from star.abstraction.regions import Change
 from star.agent.decisions import Decision, Roadmap
@@ -51,13 +51,6 @@ def plan(
 def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, periods: int) -> CommanderState:
     """Greedy episodes follow the same values."""
     return state
-
-
-def staying(
-    section: CommanderConfig, state: CommanderState, region: Int[Array, "B"], goal_region: Int[Array, "B"]
-) -> Float[Array, "B R"]:
-    """Nothing is known of where commands lead: half of them stay."""
-    return jnp.full((len(region), len(state.chosen)), 0.5)
 
 
 def follow(section: CommanderConfig, state: CommanderState, change: Change, *_: Any) -> None:

@@ -41,19 +41,6 @@ class CommanderConfig(Section):
     epsilon_spread: bool = setting(
         True, "True spreads the share of random targets over the environments, from none to twice as much."
     )
-    arrival: bool = setting(
-        True, "In greedy episodes the Commander decides again as soon as the target region is reached."
-    )
-    retry: float = setting(
-        0.9, "In greedy episodes a command that led back before is worth this share of its value.", unit="", ge=0, le=1
-    )
-    trust: float = setting(
-        0.99,
-        "In greedy episodes a command that has led nowhere yet works with this chance; with 1 there are no doubts.",
-        unit="",
-        ge=0,
-        le=1,
-    )
     hold: Literal[False, True, "region"] = setting(
         True, "The goal is commanded wherever it counts as reached (true), or all over its region (region)."
     )

@@ -90,13 +90,12 @@ def act(
     box: Box,
     marks: Marks,
     *,
-    draw: Bool[Array, "B"],
+    explore: bool,
     key: Array,
 ) -> Choice:
-    """A subgoal for each environment, on the way to its target `box`: drawn where `draw` says so, else the mean."""
+    """A subgoal for each environment, on the way to its target `box`: drawn to `explore`, else the mean."""
     seen = observe(section, task, obs, box)
-    mean, drawn = (learners.act(section, state, seen, deterministic=one, key=key) for one in (True, False))
-    action = jnp.where(draw[:, None], drawn, mean)
+    action = learners.act(section, state, seen, deterministic=not explore, key=key)
     if section.straight:
         action = jnp.where(stands_close(task, obs, box)[:, None], _straight(task, obs, box.centre), action)
     if marks.way is not None and marks.way.led is not None:

@@ -42,19 +42,16 @@ def choose(
     *,
     practised: Int[Array, "B"] | None = None,
     attraction: Float[Array, "R"] | None = None,
-    worth: Float[Array, "B R"] | None = None,
     epsilon: Float[Array, "B"] | float,
     key: Array,
 ) -> Int[Array, "B"]:
     """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random.
 
     Random ones are drawn evenly, or in proportion to `attraction`. `practised` are regions to pursue instead of the
-    goal where they are not negative. `worth`, from 0 to 1, makes less of the values.
+    goal where they are not negative.
     """
     explore_key, random_key, tie_key = jax.random.split(key, 3)
     values = state.q[region, goal_region]
-    if worth is not None:
-        values -= (1 - worth) * jnp.abs(values)
     if practised is not None:
         reach = state.q if state.model is None else state.model.reach
         values = jnp.where((practised >= 0)[:, None], reach[region, practised], values)

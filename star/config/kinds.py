@@ -110,6 +110,8 @@ class Kind(NamedTuple):
     """Beginnings of settings that may differ when a run goes on, besides numbers and those of `trainer`."""
     older: Mapping[str, Any] = {}
     """Values of settings in runs that are older than these and do not name them, where they are not the defaults."""
+    gone: Sequence[str] = ()
+    """Settings that older runs name and that are no more."""
     anywhere: Mapping[str, Any] = {}
     """Settings of agents that act on another machine than that of their training."""
     pictures: tuple[str, ...] = ()

@@ -140,7 +140,7 @@ def parse(
     """Validate nested `values` after applying dotted `overrides`; raises `UserError`. As in `load`.
 
     `source` says in errors where the values come from, and `typed` where the overrides do. What is `kept` by a run or a
-    checkpoint names all settings that there were: one that it does not name is newer.
+    checkpoint names all settings that there were: one that it does not name is newer, and one may be gone.
     """
     nested = _with_overrides(plain(values), plain(overrides or {}))
     try:
@@ -150,7 +150,8 @@ def parse(
         raise ConfigError(f"{culprit}: {error}") from None
     model = kind.Config
     if kept:
-        nested = _merged(_with_overrides({}, kind.older), nested)
+        named = _with_overrides(_without(plain(values), kind.gone), plain(overrides or {}))
+        nested = _merged(_with_overrides({}, kind.older), named)
     try:
         return model.model_validate(nested)
     except ValidationError as error:
@@ -235,6 +236,16 @@ def _with_overrides(values: Mapping[str, Any], overrides: Mapping[str, Any]) -> 
             level = level[parent]
         level[last] = value
     return nested
+
+
+def _without(values: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    """Nested `values` but for these dotted `keys`."""
+    left = dict(values)
+    for key in keys:
+        section, _, name = key.rpartition(".")
+        if isinstance(inner := left.get(section), Mapping):
+            left[section] = {one: value for one, value in inner.items() if one != name}
+    return left
 
 
 _PLAIN = {

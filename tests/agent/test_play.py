@@ -1,6 +1,5 @@
 """The clocks of the levels, the moving subgoal and the statistics, against loops written from the equations."""
 
-from dataclasses import replace
 from functools import partial
 
 import jax
@@ -291,7 +290,7 @@ def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_e
         playing = levels.of(agent, spec, greedy=True)
         away = jnp.zeros_like(state.commander.q).at[..., 2].set(1.0)  # everybody is sent to region 2
         known = state.commander.replace(q=away)
-        streams = play.start(playing, breaking_env, decisions=1, key=key)
+        streams = play.start(playing, breaking_env, greedy=True, key=key)
         success = (jnp.arange(B) < 4).astype(jnp.float32)
         seen = scene_of(spec, streams.env)
         goal = jnp.where((jnp.arange(B) < 2)[:, None], seen.position, seen.goal)
@@ -312,52 +311,6 @@ def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_e
     np.testing.assert_array_equal(sent[free], ~held[free])
 
 
-@pytest.mark.parametrize("arrival", [True, False])
-def test_greedy_episodes_decide_again_where_the_target_is_reached(breaking_env, tiny, fresh, arrival, monkeypatch):
-    agent = loading.parse(tiny, {"commander.arrival": arrival}).hyper()
-    spec = replace(Spec.of(breaking_env.env), episode_length=7 * L)
-
-    def played(state, key):
-        stay = jnp.broadcast_to(jnp.eye(state.abstraction.capacity)[:, None], state.commander.q.shape)
-        monkeypatch.setattr(commander, "settle", lambda *_, **__: state.commander.replace(q=stay))
-        look = lambda env_state, subgoal, box, action: (spec.abstract(env_state.obs), box)  # noqa: E731
-        return state.abstraction, *play.greedy(agent, spec, breaking_env, state, record=look, key=key)
-
-    abstraction, streams, (path, box) = jax.device_get(jax.jit(played)(fresh(4), jax.random.key(4)))
-    path = np.concatenate([path[::L], spec.abstract(streams.env.obs)[None]])  # where each segment begins, and the end
-    lower, early = box.lower[::L], 0
-    for b in range(B):
-        clock = 0
-        goal = slow_locate(abstraction, spec.goal_point(streams.env.obs)[b])
-        for i in range(7):
-            if clock != 0:
-                np.testing.assert_array_equal(lower[i, b], lower[i - 1, b])
-            clock = (clock + L) % K
-            aimed = [j for j in range(abstraction.count) if (abstraction.lower[j] == lower[i, b]).all()]
-            if arrival and clock and aimed == [slow_locate(abstraction, path[i + 1, b])] != [goal]:
-                clock, early = 0, early + 1
-        assert streams.memory.clock[b] == clock
-    assert (0 < early < 7 * B) == arrival
-
-
-def test_the_tutor_draws_subgoals_in_greedy_episodes_where_commands_were_in_vain_and_nowhere_else(
-    breaking_env, tiny, fresh, monkeypatch
-):
-    agent = loading.parse(tiny, {"tutor.straight": False}).hyper()
-    spec = replace(Spec.of(breaking_env.env), episode_length=L)
-    odd = jnp.arange(B) % 2 == 1
-
-    def played(state, in_vain, key):
-        monkeypatch.setattr(commander, "in_vain", lambda memory, success: in_vain)
-        record = lambda env_state, subgoal, box, action: subgoal  # noqa: E731
-        return play.greedy(agent, spec, breaking_env, state, record=record, key=key)[1][0]
-
-    subgoals = [jax.jit(played)(fresh(), in_vain, jax.random.key(4)) for in_vain in (odd & False, odd, odd | True)]
-    never, where_odd, always = map(np.asarray, subgoals)
-    np.testing.assert_array_equal(where_odd, np.where(odd[:, None], always, never))
-    assert (always != never).all()
-
-
 def test_an_episode_shorter_than_a_period_has_a_plan_too(tiny, fresh):
     agent, state = loading.parse(tiny).hyper(), fresh()
     roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
@@ -367,80 +320,3 @@ def test_an_episode_shorter_than_a_period_has_a_plan_too(tiny, fresh):
     short, one = (settle(episode_length=steps).q for steps in (K - L, K))
     assert np.asarray(one).any()
     np.testing.assert_array_equal(short, one)
-
-
-@pytest.fixture(scope="module")
-def told(breaking_env):
-    """The memory of who is told where to go next, having got somewhere; without one, how the episode begins."""
-    spec = replace(Spec.of(breaking_env.env), episode_length=40 * L)
-
-    @jax.jit
-    def told(agent, state, memory=None, where=None, success=None):
-        playing = levels.of(agent, spec, greedy=True)
-        streams = play.start(playing, breaking_env, decisions=40, key=jax.random.key(2))
-        seen = scene_of(spec, streams.env)
-        roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
-        if memory is None:
-            return seen, streams.memory, roadmap
-        middles = (state.abstraction.lower + state.abstraction.upper) / 2
-        there = seen._replace(position=middles[where], success=success)
-        memory = memory.replace(clock=jnp.zeros(B, jnp.int32))
-        key = jax.random.key(1)
-        return commander.command(
-            agent.commander, playing.task, state.commander, roadmap, memory, there, Marks(), env_steps=None, key=key
-        )
-
-    return told
-
-
-@pytest.mark.parametrize(("retry", "trust"), [(0.9, 0.99), (0.5, 1.0), (1.0, 0.5), (1.0, 1.0)])
-def test_what_led_back_or_nowhere_in_this_episode_is_worth_less(tiny, fresh, told, retry, trust):
-    agent = loading.parse(tiny, {"commander.retry": retry, "commander.trust": trust, "commander.hold": False}).hyper()
-    state = fresh()
-    n, rng = int(state.abstraction.count), np.random.default_rng(0)
-    q, visits = rng.uniform(0, 1, state.commander.q.shape), rng.uniform(0, 9, state.commander.q.shape)
-    led, rewards = rng.uniform(0, 9, state.commander.model.led.shape), visits * rng.uniform(0, 1, visits.shape)
-    model = state.commander.model.replace(
-        led=jnp.asarray(led, jnp.float32),
-        visits=jnp.asarray(visits, jnp.float32),
-        rewards=jnp.asarray(rewards, jnp.float32),
-    )
-    state = state.replace(commander=state.commander.replace(q=jnp.asarray(q, jnp.float32), model=model))
-    seen, memory, roadmap = told(agent, state)
-    allowed = np.asarray(roadmap.allowed.greedy)
-    route = rng.integers(0, 3, (25, B))  # regions in which decisions are made
-    succeeds = rng.random((25, B)) < 0.3
-
-    def staying(i, g, j):
-        """How likely the command is not to lead out, or the goal in the region not to be reached."""
-        half = agent.commander.prior / 2
-        if i == g == j:
-            return 1 - (rewards[i, g, j] + half) / (visits[i, g, j] + 2 * half)
-        counts = led[1 if j == g else 0, i, j]
-        return (counts[i] + half) / (counts.sum() + 2 * half)
-
-    goal = [slow_locate(state.abstraction, point) for point in np.asarray(seen.goal)]
-    left, stayed, changed = np.zeros((B, n, n)), np.zeros((B, n, n)), 0
-    before, target = np.asarray(memory.region), np.zeros(B, int)
-    last, vain = [""] * B, 0  # what the last decision came to
-    for now, success in zip(route, succeeds, strict=True):
-        memory = told(agent, state, memory, now, jnp.asarray(success, jnp.float32))
-        in_vain = commander.in_vain(memory, jnp.asarray(success, jnp.float32))
-        for b in range(B):
-            if now[b] != before[b] >= 0:
-                left[b, before[b], target[b]] += 1
-                last[b] = "left"
-            elif now[b] == before[b] and not success[b]:
-                stayed[b, now[b], target[b]] += 1
-                last[b] = "stayed"
-            assert in_vain[b] == (last[b] == "stayed" and not success[b])
-            vain += int(in_vain[b])
-            values = q[now[b], goal[b], :n]
-            luck = np.array([staying(now[b], goal[b], j) for j in range(n)]) ** stayed[b, now[b]]
-            known = values * retry ** left[b, now[b]] * luck / (trust * luck + 1 - trust)
-            may = allowed[now[b], :n] | (np.arange(n) == now[b])
-            best = int(np.argmax(np.where(may, known, -np.inf)))
-            assert memory.target[b] == best
-            changed += best != int(np.argmax(np.where(may, values, -np.inf)))
-        before, target = now, np.asarray(memory.target)
-    assert (changed > 20) == (min(retry, trust) < 1) and 0 < vain < 25 * B

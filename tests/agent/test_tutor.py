@@ -70,7 +70,7 @@ def test_a_box_around_a_goal_close_by_is_aimed_at_and_teaches_nothing(straight):
     centre = jnp.array([[5.0, 3.0], [5.0, 4.1], [5.0, 3.0]])
     box = Box.around(centre, jnp.array([[margin], [margin], [1.2 * margin]]))
     state, marks = tutor.init(jax.random.key(0), section, known), Marks()
-    choice = tutor.act(section, known, state, obs, box, marks, draw=jnp.ones(3, bool), key=jax.random.key(1))
+    choice = tutor.act(section, known, state, obs, box, marks, explore=True, key=jax.random.key(1))
     aimed = np.linalg.norm(choice.subgoal - (box.centre - obs[:, :2]), axis=1) < 1e-6
     assert aimed.tolist() == [straight, False, False]
     steps = jnp.zeros((L, 3))

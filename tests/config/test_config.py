@@ -535,3 +535,13 @@ def test_hold_has_three_values():
         assert parse({}, {"commander.hold": value}).commander.hold is value
     with pytest.raises(UserError, match=r"commander.hold: 'goal' is not allowed: should be false, true or 'region'$"):
         parse({}, {"commander.hold": "goal"})
+
+
+def test_settings_that_are_no_more_are_known_of_older_runs_alone(tmp_path):
+    (tmp_path / "config.yaml").write_text("env: {name: point_maze}\ncommander: {retry: 0.9, trust: 0.99, period: 20}\n")
+    found = loading.load_run(tmp_path, {"commander.period": 40})
+    assert found.commander.period == 40 and not hasattr(found.commander, "retry")
+    with pytest.raises(UserError, match=r"^command line: commander\.retry: unknown key"):
+        loading.load_run(tmp_path, {"commander.retry": 1})
+    with pytest.raises(UserError, match=r"config\.yaml: commander\.retry: unknown key"):
+        loading.load(tmp_path / "config.yaml")

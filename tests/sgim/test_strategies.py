@@ -470,7 +470,7 @@ def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(t
 
     @jax.jit
     def commanded(state, key, waypoints):
-        streams = play.start(playing, breaking_env, decisions=1, key=key)
+        streams = play.start(playing, breaking_env, greedy=True, key=key)
         memory, *_ = commanded_in(playing, state, streams, lesson.replace(waypoints=waypoints), key=key)
         return state.abstraction, spec.goal_point(streams.env.obs), memory
 
@@ -511,7 +511,7 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
             nowhere, position = jnp.zeros(n, bool), turning.abstract(obs)
             _, marks = lessons.mark(agent.sgim, lesson, state.abstraction, position, due=nowhere)
         box = streams.memory.box
-        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, box, marks, draw=jnp.ones(n, bool), key=key)
+        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, box, marks, explore=True, key=key)
         _, passed = play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)
         learnt = tutor.experience(agent.tutor, playing.task, passed, marks, renewed=jnp.zeros(n, bool))
         return obs, choice.subgoal, learnt
@@ -571,11 +571,10 @@ def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, 
     @jax.jit
     def finished(key, terminated):
         state = levels.init(agent, spec, key=key)
-        streams = play.start(playing, breaking_env, decisions=1, key=key)
+        streams = play.start(playing, breaking_env, greedy=True, key=key)
         memory, marks, roadmap = commanded_in(playing, state, streams, lesson, key=key)
         obs, section = streams.env.obs, agent.commander
-        everywhere = jnp.ones(len(obs), bool)
-        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, memory.box, marks, draw=everywhere, key=key)
+        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, memory.box, marks, explore=True, key=key)
         streams = streams.replace(memory=memory)
         _, passed = play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)
         ones = jnp.ones_like(passed.alive)
