@@ -15,7 +15,6 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,13 +33,18 @@ obs, info = env.reset(seed=0)
 for _ in range(20): obs, *_ = env.step(agent.act(obs))
 print(star.__file__, obs["achieved_goal"])
 """
-COMMANDS = """
+# All in one process, as imports take seconds: a script, then commands as the console script does them.
+USE = """
 import sys
+script, *commands = sys.argv[1:]
+exec(script)
 from star.cli import main
-for command in sys.argv[1:]:
+for command in commands:
+    print(f"star {command}", flush=True)
     if code := main(command.split()): sys.exit(code)
 """
 DRAW = "render ant_maze --out film.gif --steps 10 --every 5 --height 120 --quiet"
+CANNOT_DRAW = ("pictures need OpenGL", "MUJOCO_GL")
 
 
 def main() -> None:
@@ -57,13 +61,17 @@ def main() -> None:
             path.chmod(0o777)
         user = Newcomer(work, site)
         print(f"{wheel.name}: {wheel.stat().st_size / 1e6:.1f} MB")
-        user.star(SMALL, "ls", "evaluate runs/mine --quiet --json", "report runs/mine --out report.html")
+        commands = (SMALL, "ls", "evaluate runs/mine --quiet --json", "report runs/mine --out report.html", DRAW)
         # A script beside a folder `envs` would import that one, so it is run as a module is: from elsewhere.
-        said = user.python(["-P", "-c", ACT])
-        if not said.startswith(str(site)):
-            raise SystemExit(f"star was imported from {said}")
-        if user.star(DRAW, may_fail=("pictures need OpenGL", "MUJOCO_GL")):
-            print("drawn: film.gif")
+        done = user.python("-P", "-c", USE, ACT, *commands)
+        print(done.stdout.rstrip())
+        if not done.stdout.startswith(str(site)):
+            raise SystemExit(f"star was imported from elsewhere than {site}\n{done.stderr}")
+        if f"star {DRAW}" not in done.stdout or (
+            done.returncode and not any(one in done.stderr for one in CANNOT_DRAW)
+        ):
+            raise SystemExit(f"code {done.returncode}\n{done.stderr}")
+        print(f"not drawn: {done.stderr.strip()}" if done.returncode else "drawn: film.gif")
 
 
 class Newcomer:
@@ -77,31 +85,12 @@ class Newcomer:
         self._who = another() if os.geteuid() == 0 else {}
         print("as another user" if self._who else "as this user, in another home")
 
-    def star(self, *commands: str, may_fail: Sequence[str] = ()) -> bool:
-        """Run commands in one process, as the console script does; False if one fails for a reason that it may have."""
-        done = self._run(["-P", "-c", COMMANDS, *commands])
-        if done.returncode and any(reason in done.stderr for reason in may_fail):
-            print(f"star {commands[0]}: {done.stderr.strip()}")
-            return False
-        self._check("\n".join(f"star {command}" for command in commands), done)
-        return True
-
-    def python(self, words: Sequence[str]) -> str:
-        """The output of a script."""
-        done = self._run(words)
-        self._check("python", done)
-        return done.stdout
-
-    def _run(self, words: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    def python(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Python with these arguments, run to its end."""
         command = [sys.executable, *words]
         return subprocess.run(
             command, cwd=self._work, env=self._environment, capture_output=True, text=True, **self._who
         )
-
-    def _check(self, name: str, done: subprocess.CompletedProcess[str]) -> None:
-        if done.returncode:
-            raise SystemExit(f"{name}: code {done.returncode}\n{done.stdout}{done.stderr}")
-        print(f"{name}\n{done.stdout}".rstrip())
 
 
 def another() -> dict[str, Any]:

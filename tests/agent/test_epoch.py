@@ -292,28 +292,32 @@ def test_sgim_follows_the_agent_through_its_epochs(jitted, course):
 def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
     config, spec = jitted.config.hyper(), jitted.spec
     state = jitted.init(jax.random.key(0))
+    state = jax.device_get(state.replace(key=None, controller=None, tutor=None))  # so that `refined` alone is compiled
     before = state.abstraction
     capacity = before.capacity
     count = int(state.abstraction.count)
-    q = jnp.arange(float(capacity**3)).reshape(3 * (capacity,))
+    q = np.arange(float(capacity**3), dtype=np.float32).reshape(3 * (capacity,))
     # A model that predicts a step of +0.1 along x, and one due pair that it splits: region 0 and the next along x.
-    params = jax.tree.map(jnp.zeros_like, state.forward_model.params)
+    params = jax.tree.map(np.zeros_like, state.forward_model.params)
     half = (state.abstraction.space[1] - state.abstraction.space[0]) / 2
     last = params["params"]["Dense_1"]
-    params = {"params": {**params["params"], "Dense_1": {**last, "bias": jnp.array([1.9, 0.0]) / half}}}
+    params = {"params": {**params["params"], "Dense_1": {**last, "bias": np.array([1.9, 0.0], np.float32) / half}}}
     rng = np.random.default_rng(0)
-    starts = jnp.asarray(rng.uniform(-4, -0.2, (64, 2)), jnp.float32)
-    example, _ = replay.contents(state.forward_model.ring)
-    ring = replay.add(state.forward_model.ring, example.replace(start=starts, weight=jnp.ones(64)))
+    starts = rng.uniform(-4, -0.2, (64, 2)).astype(np.float32)
+
+    def filled(ring):
+        example, _ = replay.contents(ring)
+        return replay.add(ring, example.replace(start=starts, weight=jnp.ones(64)))
+
     target = 4  # the grid of 4 x 4 is stored row by row, so this is the box beside region 0 along x
+    ring = jax.jit(filled)(state.forward_model.ring)
+    upper, transitions, stable = (np.array(x) for x in (before.upper, state.graph.transitions, state.graph.stable))
+    upper[target, 0], transitions[0, target], stable[0, target] = 2.0, 9.0, True
     state = state.replace(
-        commander=state.commander.replace(q=q, chosen=jnp.ones(capacity)),
+        commander=state.commander.replace(q=q, chosen=np.ones(capacity, np.float32)),
         forward_model=state.forward_model.replace(params=params, ring=ring),
-        abstraction=state.abstraction.replace(upper=state.abstraction.upper.at[target, 0].set(2.0)),
-        graph=state.graph.replace(
-            transitions=state.graph.transitions.at[0, target].set(9.0),
-            stable=state.graph.stable.at[0, target].set(True),
-        ),
+        abstraction=before.replace(upper=upper),
+        graph=state.graph.replace(transitions=transitions, stable=stable),
     )
     goals = Outcome(*jnp.zeros((4, 1, 2)), weight=jnp.zeros(1))
 
@@ -329,7 +333,7 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
             key=jax.random.key(0),
         )
 
-    _, change, metrics = refined(state)
+    _, change, metrics = jax.device_get(refined(state))
     assert int(metrics["splits"]) == 1
     assert int(change.after.count) == count + 1
     expected = np.array(q)
@@ -337,16 +341,19 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
     expected[:, count] = expected[:, 0]
     expected[:, :, count] = expected[:, :, 0]
     # Without the overlap, in which nobody can be located: one decision from each part to the other.
-    mended = change.after.replace(upper=change.after.upper.at[target].set(before.upper[target]))
+    upper = np.array(change.after.upper)
+    upper[target] = before.upper[target]
+    mended = change.after.replace(upper=upper)
     change = change.replace(after=mended)
-    start, end, goal = (mended.lower[jnp.array(where)] + 0.01 for where in ([0, count], [count, 0], [target, count]))
-    ones, region = jnp.ones(2), jnp.zeros(2, jnp.int32)
-    decision = Decision(
-        region, jnp.array([target, 0]), jnp.array([target, 0]), ones, region, ones, *[0 * ones] * 3, goal=goal
+    start, end, goal = (
+        mended.lower[np.array(where)] + np.float32(0.01) for where in ([0, count], [count, 0], [target, count])
     )
+    ones, region = np.ones(2, np.float32), np.zeros(2, np.int32)
+    aims = np.array([target, 0], np.int32)
+    decision = Decision(region, aims, aims, ones, region, ones, *[0 * ones] * 3, goal=goal)
     outcome = Outcome(start=start, lower=start, upper=start, end=end, weight=ones)
     known, follow = state.commander, jax.jit(commander.follow)
-    of_epoch = Finished(decision, outcome), jnp.zeros_like(known.q[0])
+    of_epoch = Finished(decision, outcome), np.zeros_like(known.q[0])
     learnt = follow(config.commander, known, change, known, *of_epoch)
     np.testing.assert_array_equal(learnt.q, expected)
     without = known.replace(model=None)
@@ -385,13 +392,19 @@ def test_the_commander_can_be_left_out(hrac):
     """In `test_trainer.py` both upper levels are, and in `test_development.py` the Tutor."""
     start = hrac.init(jax.random.key(0))
     end, metrics = hrac.one(hrac.config.hyper(), start)
-    moved = jax.tree.map(lambda a, b: bool((a != b).any()), start, end)
-    assert any(jax.tree.leaves(moved.controller.params))
+    moved = {
+        name: any((a != b).any() for a, b in zip(*map(to_numpy, pair), strict=True))
+        for name, pair in {
+            "controller": (start.controller.params, end.controller.params),
+            "actor": (start.tutor.params["actor"], end.tutor.params["actor"]),
+            "critic": (start.tutor.params["critic"], end.tutor.params["critic"]),
+        }.items()
+    }
+    assert all(moved.values()), moved
     assert "tutor/q" in metrics
     assert int(end.tutor.updates) == 2 * (hrac.spec.episode_length // (2 * L) - 1)  # not of the first 16 decisions
-    assert all(any(jax.tree.leaves(moved.tutor.params[part])) for part in ("actor", "critic"))
-    assert "abstraction/regions" not in metrics and not end.commander.chosen.any()
-    assert bool(end.adjacency.adjacent.any())
+    assert "abstraction/regions" not in metrics and not np.any(jax.device_get(end.commander.chosen))
+    assert np.any(jax.device_get(end.adjacency.adjacent))
 
 
 @pytest.mark.parametrize("tutored", [True, False])

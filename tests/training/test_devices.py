@@ -6,22 +6,28 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from envs.common.errors import UserError
 from star import cli, devices
 from star.config.loading import parse
+from star.training.checkpoint import opened
 from tests.small import RUN
 
 ROOT = Path(__file__).parents[2]
 
 REPLAY = """
+import sys
+from pathlib import Path
 import jax, jax.numpy as jnp, numpy as np
 from envs.common.batching import flattened, shared_out
 from star import devices
+from star.agent.sections import Config
 from star.learners import td3
 from star.learners.replay import Transition
 from star.learners.sections import TD3Config
+from star.training.checkpoint import Checkpoints
 
 config = TD3Config(hidden=(8,), batch_size=16, buffer_size=64, updates_per_rollout=2, min_transitions=16)
 zero, number = jnp.zeros(()), lambda *shape: jax.random.normal(jax.random.key(len(shape)), shape)
@@ -63,6 +69,10 @@ drifted = jax.make_array_from_single_device_arrays(
     enumerate(jax.devices())])
 same = jax.jit(devices.on(devices.mesh(4), devices.as_on_first))(drifted + 1)
 assert [float(shard.data[0]) for shard in same.addressable_shards] == [1.0] * 4
+
+checkpoints = Checkpoints(Path(sys.argv[1]))
+checkpoints.save(7, {"x": jax.device_put(jnp.arange(3.0), jax.devices()[3])}, Config(), score=0.0)
+checkpoints.close()
 """
 
 PROCESS = """
@@ -118,14 +128,28 @@ def end(process):
     assert process.returncode == 0, error
 
 
-def test_replay_is_cut_among_devices_and_learns_the_same_and_copies_follow_the_first():
-    end(start(REPLAY, count=4))
+@pytest.fixture(scope="module")
+def four(tmp_path_factory):
+    """How a process with four devices ended, and the folder of the checkpoint that it saved on the last one."""
+    folder = tmp_path_factory.mktemp("four")
+    process = start(REPLAY, folder, count=4)
+    error = process.communicate(timeout=240)[1]
+    return process.returncode, error, folder
+
+
+def test_replay_is_cut_among_devices_and_learns_the_same_and_copies_follow_the_first(four):
+    code, error, _ = four
+    assert code == 0, error
+
+
+def test_a_checkpoint_loads_on_a_machine_without_the_device_it_was_saved_on(four):
+    with opened(four[-1]) as checkpoints:
+        assert checkpoints.restore(7, {"x": np.zeros(3, np.float32)})["x"].tolist() == [0, 1, 2]
 
 
 def test_two_processes_step_one_batch_and_the_first_alone_writes(tmp_path):
     import jax
     import jax.numpy as jnp
-    import numpy as np
 
     from envs import VectorEnv, make
     from star.training.checkpoint import Checkpoints
