@@ -3,7 +3,6 @@
 from functools import partial
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -15,12 +14,16 @@ DEPTH = 5
 
 def displaced(by):
     """X -> x + by, exactly."""
-    by = jnp.asarray(by, jnp.float32)
-    return Network(layers=((jnp.zeros((by.size, by.size)), by),), residual=True)
+    return Network(layers=((np.zeros((by.size, by.size), np.float32), by),), residual=True)
 
 
 def f32(*arrays):
-    return tuple(jnp.asarray(a, jnp.float32) for a in arrays)
+    return tuple(np.asarray(a, np.float32) for a in arrays)
+
+
+# Compiled once, not each time that a test calls them.
+shares, smear, summary = (jax.jit(one) for one in (reachability.shares, reachability.smear, reachability.summary))
+judge, reaches_where_visited = jax.jit(reachability.judge), jax.jit(reachability.reaches_where_visited)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +49,7 @@ def examine():
         starts = np.zeros((64, 2)) if starts is None else starts
         seen = np.ones(64) if seen is None else seen
         args = (*f32(by), f32(*box), f32(*target), *f32(starts, seen))
-        return run(*args, reach_share, miss_share, min_visits)
+        return jax.device_get(run(*args, reach_share, miss_share, min_visits))
 
     return call
 
@@ -68,7 +71,7 @@ def examine():
     ],
 )
 def test_shares_by_hand(lower, upper, target, c1, c2):
-    got = reachability.shares(*f32(lower, upper), f32(*target))
+    got = np.asarray(shares(*f32(lower, upper), f32(*target)))
     np.testing.assert_allclose(got, (c1, c2), rtol=1e-6)
 
 
@@ -83,23 +86,23 @@ def test_shares_by_hand(lower, upper, target, c1, c2):
 )
 def test_judge_by_hand(upper, verdict):
     target = f32((0.0,), (8.0,))
-    assert int(reachability.judge(*f32((0.0,), (upper,)), target, reach_share=0.75, miss_share=0.1)) == verdict
+    assert int(judge(*f32((0.0,), (upper,)), target, reach_share=0.75, miss_share=0.1)) == verdict
 
 
 def test_a_hull_that_covers_little_of_the_target_misses():
     target = f32((0.0,), (10.0,))
-    judge = partial(reachability.judge, target=target, reach_share=0.7, miss_share=0.125)
-    assert int(judge(*f32((-5.0,), (1.25,)))) == MISSES  # c2 is exactly the share that misses
-    assert int(judge(*f32((-5.0,), (1.5,)))) == UNKNOWN
+    judged = partial(judge, target=target, reach_share=0.7, miss_share=0.125)
+    assert int(judged(*f32((-5.0,), (1.25,)))) == MISSES  # c2 is exactly the share that misses
+    assert int(judged(*f32((-5.0,), (1.5,)))) == UNKNOWN
 
 
 def test_smear_of_a_linear_map_is_exact():
     weight = np.array([[1.0, -2.0], [3.0, 0.5]])
     lower, upper = f32((0.0, 1.0), (2.0, 4.0))
     network = Network(layers=(f32(weight, np.zeros(2)),))
-    np.testing.assert_allclose(reachability.smear(network, lower, upper), [4.0 * 1.0, 2.5 * 1.5], rtol=1e-6)
+    np.testing.assert_allclose(smear(network, lower, upper), [4.0 * 1.0, 2.5 * 1.5], rtol=1e-6)
     residual = network.replace(residual=True)
-    np.testing.assert_allclose(reachability.smear(residual, lower, upper), [5.0 * 1.0, 3.5 * 1.5], rtol=1e-6)
+    np.testing.assert_allclose(smear(residual, lower, upper), [5.0 * 1.0, 3.5 * 1.5], rtol=1e-6)
 
 
 def test_an_unknown_part_is_halved_along_its_largest_smear():
@@ -167,7 +170,7 @@ def test_where_room_is_scarce_the_parts_with_most_visits_are_halved():
     examined = jax.jit(partial(reachability.examine, move, **how))
     for few, many in (([1.0], [6.0]), ([6.0], [1.0])):
         starts, seen = f32(np.array([few] * 5 + [many] * 9), np.ones(14))
-        leaves = examined(*corners, starts, seen)
+        leaves = jax.device_get(examined(*corners, starts, seen))
         lower, upper, _ = used(leaves)
         halved = 0.0 if many == [1.0] else 4.0
         assert sorted(zip(lower[:, 0], upper[:, 0], strict=True)) == sorted(
@@ -191,7 +194,7 @@ def test_parts_that_stay_undecided_do_not_reach(examine):
     box, target = ((0, 0), (400, 1)), ((-1000, 0), (1000, 0.5))
     leaves = examine(box, target, reach_share=0.7, miss_share=1e-6)
     assert not leaves.reaches.any()
-    assert int(reachability.summary(leaves)) == MISSES
+    assert int(summary(leaves)) == MISSES
     assert used(examine(box, target, reach_share=0.4, miss_share=1e-6))[2].all()
 
 
@@ -222,7 +225,7 @@ def test_starts_count_for_the_part_they_lie_in(examine):
     [((True, True), REACHES), ((False, False), MISSES), ((True, False), MIXED), ((False, True), MIXED)],
 )
 def test_summary_of_leaves(reaches, verdict):
-    assert int(reachability.summary(leaves_of(reaches, (True, False)))) == verdict
+    assert int(summary(leaves_of(reaches, (True, False)))) == verdict
 
 
 @pytest.mark.parametrize(
@@ -235,10 +238,10 @@ def test_summary_of_leaves(reaches, verdict):
     ],
 )
 def test_whether_all_leaves_reach_where_agents_have_been(reaches, visited, whole):
-    assert bool(reachability.reaches_where_visited(leaves_of(reaches, visited))) == whole
+    assert bool(reaches_where_visited(leaves_of(reaches, visited))) == whole
 
 
 def leaves_of(reaches, visited):
-    corners = jnp.zeros((len(reaches) + 1, 1))
-    masks = (jnp.array([*mask, False]) for mask in (reaches, visited, [True] * len(reaches)))  # one place not in use
+    corners = np.zeros((len(reaches) + 1, 1), np.float32)
+    masks = (np.array([*mask, False]) for mask in (reaches, visited, [True] * len(reaches)))  # one place not in use
     return Leaves(corners, corners, *masks)

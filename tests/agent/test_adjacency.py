@@ -1,7 +1,6 @@
 """HRAC's adjacency: what counts as adjacent, what the network learns of it, and what it makes of the Tutor."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -16,16 +15,28 @@ def settings(**values):
     return loading.parse({}, {f"tutor.adjacency.{key}": value for key, value in values.items()}).tutor.adjacency
 
 
+LEARNING = settings(updates_per_epoch=300, learning_rate=1e-2)  # after which nothing changes any more
+
+
 @pytest.fixture(scope="module")
 def fresh():
-    return adjacency.init(jax.random.key(0), settings(), SPACE)
+    return jax.jit(lambda key: adjacency.init(key, settings(), SPACE))(jax.random.key(0))
+
+
+def locate(points, **values):
+    return np.asarray(jax.jit(lambda points: adjacency.locate(settings(**values), SPACE, points))(np.float32(points)))
+
+
+@jax.jit
+def train(chosen, state, key):
+    return adjacency.train(chosen, state, SPACE, key=key)
 
 
 def test_a_point_lies_in_the_cell_of_its_whole_coordinates_or_the_nearest():
     assert adjacency.shape(settings(), SPACE) == (6, 4)
     assert adjacency.shape(settings(cell=2), SPACE) == (3, 2)
-    points = jnp.array([[-2.0, 0.0], [-1.01, 0.99], [-1.0, 0.0], [0.5, 2.5], [99.0, -99.0]])
-    assert adjacency.locate(settings(), SPACE, points).tolist() == [0, 0, 4, 10, 20]
+    points = [[-2.0, 0.0], [-1.01, 0.99], [-1.0, 0.0], [0.5, 2.5], [99.0, -99.0]]
+    assert locate(points).tolist() == [0, 0, 4, 10, 20]
 
 
 def test_cells_of_one_decision_are_adjacent_and_those_after_its_end_are_not(fresh):
@@ -35,7 +46,7 @@ def test_cells_of_one_decision_are_adjacent_and_those_after_its_end_are_not(fres
     alive[1:, 2] = 0
     alive[2:, 3] = 0
     seen = jax.jit(lambda *walked: adjacency.observe(settings(), fresh, SPACE, *walked).adjacent)(path, alive)
-    cell = np.asarray(adjacency.locate(settings(), SPACE, path))
+    cell = locate(path)
     expected = np.zeros((24, 24), bool)
     for b in range(5):
         last = int(alive[:, b].sum())
@@ -53,17 +64,14 @@ def test_the_network_learns_who_is_adjacent_and_prices_other_subgoals(fresh):
     known = np.eye(24, dtype=bool)
     for x in range(5):
         known[cells[x], cells[x + 1]] = known[cells[x + 1], cells[x]] = True
-    chosen = settings(updates_per_epoch=1500, learning_rate=3e-3)
-    state, metrics = jax.jit(lambda c, s, key: adjacency.train(c, s, SPACE, key=key))(
-        chosen, fresh.replace(adjacent=jnp.asarray(known)), jax.random.key(1)
-    )
+    state, metrics = train(LEARNING, fresh.replace(adjacent=known), jax.random.key(1))
     assert float(metrics["share"]) == pytest.approx(known.sum() / 24**2)
-    start = jnp.array([[-1.5, 0.5]] * 3)
-    price = adjacency.penalty(chosen, state, start, jnp.array([[0.0, 0.0], [1.0, 0.0], [0.0, 3.0]]))
+    start, subgoal = np.float32([[-1.5, 0.5]] * 3), np.float32([[0.0, 0.0], [1.0, 0.0], [0.0, 3.0]])
+    price = np.asarray(jax.jit(adjacency.penalty)(LEARNING, state, start, subgoal))
     assert float(price[0]) == 0 and float(price[1]) < 1 < float(price[2])
 
 
 def test_nothing_known_teaches_nothing(fresh):
-    state, metrics = adjacency.train(settings(updates_per_epoch=2), fresh, SPACE, key=jax.random.key(0))
+    state, metrics = train(LEARNING, fresh, jax.random.key(0))
     assert float(metrics["loss"]) == 0
     jax.tree.map(np.testing.assert_array_equal, state.params, fresh.params)

@@ -22,15 +22,35 @@ R, N = 5, 40
 counts = jax.jit(planning.observe)
 recounted = jax.jit(planning.recounted)
 plan, settle = jax.jit(commander.plan), jax.jit(planning.settle, static_argnames="periods")
-fade = jax.jit(commander.fade)
-choose = jax.jit(values.choose)
+fade, follow = jax.jit(commander.fade), jax.jit(commander.follow)
+towards = jax.jit(values.towards)
+follows = jax.jit(successors, static_argnums=0)
+spread = jax.jit(commander.spread, static_argnames="num_envs")
+
+
+@jax.jit
+def chosen_by(state, allowed, region, goal_region, practised, epsilon, key):
+    return values.choose(state, allowed, region, goal_region, practised=practised, epsilon=epsilon, key=key)
+
+
+def choose(state, allowed, region, goal_region, *, practised=-1, epsilon, n=4000):
+    """The targets of `n` who are in a region, or of each in an array; they practise no region that is negative."""
+    whole = lambda number: np.broadcast_to(np.asarray(number, np.int32), n)  # noqa: E731
+    where = whole(region), whole(goal_region), whole(practised)
+    return np.asarray(chosen_by(state, allowed, *where, epsilon, jax.random.key(0)))
+
+
+def begun(chosen):
+    """Nothing learnt yet, in NumPy."""
+    return jax.device_get(commander.init(chosen, regions=R))
+
+
+EVERYTHING = Successors(np.ones((R, R), bool), np.ones((R, R), bool))
 
 
 def known(allowed, believed=None):
     """A roadmap that says so; where the regions lie is of no account."""
-    return Roadmap(
-        abstraction=None, allowed=allowed, believed=jnp.zeros((R, R), bool) if believed is None else believed
-    )
+    return Roadmap(abstraction=None, allowed=allowed, believed=np.zeros((R, R), bool) if believed is None else believed)
 
 
 def counted(chosen, state, batch):
@@ -61,10 +81,10 @@ def random_batch(seed):
 
 def random_state(seed):
     rng = np.random.default_rng(seed)
-    q = jnp.asarray(-rng.random((R, R, R)), jnp.float32)
+    q = -rng.random((R, R, R)).astype(np.float32)
     allowed = rng.random((R, R)) < 0.6
     np.fill_diagonal(allowed, True)
-    return CommanderState(q=q, chosen=jnp.zeros(R)), Successors(jnp.asarray(allowed), jnp.asarray(allowed))
+    return CommanderState(q=q, chosen=np.zeros(R, np.float32)), Successors(allowed, allowed)
 
 
 def slow_update(q, allowed, batch, *, alpha, discount):
@@ -112,28 +132,25 @@ def test_q_learning_averages_the_errors_of_each_cell(observe, seed):
 def test_who_loses_the_task_at_a_distance_does_no_better_than_who_waits_there(observe, learner):
     """Whatever the learner: an end must not look like a way out of rewards that are negative."""
     chosen = settings(learner=learner, reward="mean", discount=0.9, learning_rate=1.0, prior=1e-3, sweeps=200)
-    empty = commander.init(chosen, regions=R)
-    everything = jnp.ones((R, R), bool)
-    allowed = Successors(everything, everything)
 
     def value(batch):
-        state = empty
+        state = begun(chosen)
         for _ in range(200):
-            state = observe(chosen, state, allowed, batch)
-        return float(plan(chosen, state, known(allowed)).q[1, 4, 2])
+            state = observe(chosen, state, EVERYTHING, batch)
+        return float(np.asarray(plan(chosen, state, known(EVERYTHING)).q)[1, 4, 2])
 
-    distance = jnp.full(1, 7.0)
-    end = commander.lost_reward(chosen, jnp.zeros(1), commander.worth(chosen, distance, jnp.zeros(1)))
+    nothing, lost_reward, worth = np.zeros(1, np.float32), jax.jit(commander.lost_reward), jax.jit(commander.worth)
+    end = np.asarray(lost_reward(chosen, nothing, worth(chosen, nothing + 7, nothing)))
     loses = value(many(1, 2, 0, count=8, lost=1.0, reward=float(end[0])).replace(weight=np.zeros(8, np.float32)))
     assert loses == pytest.approx(-70.0, rel=1e-2)
     assert settings().reward == "success"
-    np.testing.assert_array_equal(commander.lost_reward(settings(), jnp.full(1, 0.3), jnp.ones(1)), np.float32([0.3]))
+    np.testing.assert_array_equal(lost_reward(settings(), nothing + np.float32(0.3), nothing + 1), np.float32([0.3]))
 
 
 def test_the_measured_reward_is_that_of_whole_periods_with_the_goal_of_the_task():
     state, allowed = random_state(0)
     batch = random_batch(0)
-    metrics = commander.measure(settings(), state, known(allowed), batch)
+    metrics = jax.jit(commander.measure)(settings(), state, known(allowed), batch)
     np.testing.assert_allclose(
         metrics["reward"], batch.reward[batch.weight > batch.practised + batch.aside].mean(), rtol=1e-5
     )
@@ -142,10 +159,10 @@ def test_the_measured_reward_is_that_of_whole_periods_with_the_goal_of_the_task(
 @pytest.mark.parametrize("learner", ["q", "model"])
 def test_periods_with_weight_0_teach_nothing(observe, learner):
     chosen, (state, allowed) = settings(learner=learner), random_state(0)
-    state = state.replace(model=commander.init(chosen, regions=R).model)
+    state = state.replace(model=begun(chosen).model)
     nothing = np.zeros(N, np.float32)
     after = observe(chosen, state, allowed, random_batch(0).replace(weight=nothing, lost=nothing))
-    assert all(jax.tree.leaves(jax.tree.map(lambda a, b: (a == b).all(), after, state)))
+    jax.tree.map(np.testing.assert_array_equal, after, state)
 
 
 def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
@@ -197,8 +214,8 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     _, allowed = random_state(seed)
     batch = random_batch(seed)
     believed = rng.random((R, R)) < 0.4
-    state = observe(chosen, commander.init(chosen, regions=R), allowed, batch)
-    roadmap = known(allowed, jnp.array(believed))
+    state = observe(chosen, begun(chosen), allowed, batch)
+    roadmap = known(allowed, believed)
     planned = plan(chosen, state, roadmap)
     q, reach = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
     np.testing.assert_allclose(planned.q, q, rtol=1e-5)
@@ -215,14 +232,13 @@ def corridor(batch_of, *, shortcut=False, greedy=False, periods=10):
     chosen = settings(learner="model", reward="success", discount=0.9, prior=1.0, sweeps=60)
     neighbours = np.abs(np.subtract.outer(np.arange(R), np.arange(R))) == 1
     neighbours[0, 3] = shortcut
-    everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
-    state = commander.init(chosen, regions=R)
+    state = begun(chosen)
     for batch in batch_of:
         state = counted(chosen, state, batch)
-    roadmap = known(everything, jnp.array(neighbours))
+    roadmap = known(EVERYTHING, neighbours)
     if greedy:
-        return settle(chosen, state, roadmap, periods=periods).q
-    return plan(chosen, state, roadmap).q
+        return np.asarray(settle(chosen, state, roadmap, periods=periods).q)
+    return np.asarray(plan(chosen, state, roadmap).q)
 
 
 def many(region, target, next_region, *, goal=4, count=100, lost=0.0, reward=0.0):
@@ -260,9 +276,11 @@ def test_greedy_episodes_go_where_others_went_and_by_belief_only_where_nobody_wa
 def test_values_stay_as_they_are_where_nothing_is_counted_or_nothing_is_best(changed):
     chosen = settings(**{"learner": "model", "reward": "success"} | changed)
     state, allowed = random_state(0)
-    state = commander.init(chosen, regions=R).replace(q=state.q)
-    roadmap = known(allowed, jnp.ones((R, R), bool))
-    settled = commander.settle(chosen, state, roadmap, episode_length=3 * chosen.period)
+    state = begun(chosen).replace(q=state.q)
+    roadmap = known(allowed, np.ones((R, R), bool))
+    settled = jax.jit(commander.settle, static_argnames="episode_length")(
+        chosen, state, roadmap, episode_length=3 * chosen.period
+    )
     np.testing.assert_array_equal(settled.q, state.q)
 
 
@@ -287,13 +305,12 @@ def test_a_wall_that_was_run_against_twenty_times_is_no_way_however_long_the_oth
 def test_where_the_goals_region_is_cut_nobody_aims_beside_the_goal():
     """Region 2, which was only aimed at for the goal in it, is cut in two, and the goal is in the new half, 3."""
     chosen = settings(learner="model", reward="success", discount=0.9, prior=1.0)
-    everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
-    state = commander.init(chosen, regions=R)
+    state = begun(chosen)
     for batch in (many(0, 2, 2, goal=2, reward=0.5), many(2, 2, 2, goal=2, reward=1.0)):
         state = counted(chosen, state, batch)
-    origin, nothing = jnp.array([0, 1, 2, 2, 4]), many(0, 0, 0, count=0)
-    state = state.replace(model=recounted(chosen, state.model, nothing, nothing, origin, jnp.ones((R, R))))
-    settled = settle(chosen, state, known(everything, jnp.ones((R, R), bool)), periods=20)
+    origin, nothing = np.array([0, 1, 2, 2, 4]), many(0, 0, 0, count=0)
+    state = state.replace(model=recounted(chosen, state.model, nothing, nothing, origin, np.ones((R, R), np.float32)))
+    settled = jax.device_get(settle(chosen, state, known(EVERYTHING, np.ones((R, R), bool)), periods=20))
     for region, goal, wrong in ((0, 3, 2), (2, 3, 2), (0, 2, 3), (3, 2, 3)):
         assert settled.q[region, goal, goal] > settled.q[region, goal, wrong] + 0.2
 
@@ -305,11 +322,11 @@ def test_a_command_that_ends_the_episode_is_worth_less_than_one_that_fails():
 
 def test_decisions_fade_by_the_memory_each_epoch_but_for_the_last_twenty_of_a_command():
     chosen = settings(learner="model", memory=0.25)
-    state = counted(chosen, commander.init(chosen, regions=R), random_batch(0))
+    state = jax.device_get(counted(chosen, begun(chosen), random_batch(0)))
     number = np.asarray(state.model.led.sum(axis=-1) + state.model.lost)
-    scale = 30 / number.max()  # some commands many times, others seldom
+    scale = np.float32(30 / number.max())  # some commands many times, others seldom
     state = state.replace(model=jax.tree.map(lambda x: scale * x, state.model))
-    faded = fade(chosen, state).model
+    faded = jax.device_get(fade(chosen, state).model)
     for n, names in ((scale * number, ("led", "lost")), (np.asarray(state.model.visits), ("rewards", "visits"))):
         for name in names:
             before, after = (np.asarray(getattr(model, name)) for model in (state.model, faded))
@@ -317,12 +334,12 @@ def test_decisions_fade_by_the_memory_each_epoch_but_for_the_last_twenty_of_a_co
                 left = 0.25 if n[cell] > 80 else min(1.0, 20 / max(n[cell], 1e-9))
                 np.testing.assert_allclose(after[cell], left * before[cell], rtol=1e-6)
     assert (scale * number > 20).any() and ((scale * number < 20) & (number > 0)).any()
-    gone = fade(chosen, state.replace(model=jax.tree.map(lambda x: 1000 * x, state.model))).model
-    np.testing.assert_allclose(gone.led.sum(), 250 * state.model.led.sum(), rtol=1e-5)
+    gone = fade(chosen, state.replace(model=jax.tree.map(lambda x: np.float32(1000) * x, state.model))).model
+    np.testing.assert_allclose(np.asarray(gone.led).sum(), 250 * state.model.led.sum(), rtol=1e-5)
 
 
 def test_success_alone_counts_or_distance_alone():
-    distance, success = jnp.array([0.5, 7.0]), jnp.array([1.0, 0.0])
+    distance, success = np.float32([0.5, 7.0]), np.float32([1.0, 0.0])
     np.testing.assert_array_equal(commander.worth(settings(reward="success"), distance, success), [1.0, 0.0])
     for reward in ("mean", "max"):
         np.testing.assert_array_equal(commander.worth(settings(reward=reward), distance, success), [-0.5, -7.0])
@@ -330,18 +347,19 @@ def test_success_alone_counts_or_distance_alone():
 
 def test_epsilon_falls_linearly_and_stays():
     chosen = settings(epsilon_start=0.9, epsilon_end=0.1, epsilon_steps=1000.0)
+    epsilon = jax.jit(commander.epsilon)
     for steps, expected in ((0, 0.9), (250, 0.7), (500, 0.5), (1000, 0.1), (5000, 0.1)):
-        np.testing.assert_allclose(commander.epsilon(chosen, jnp.float32(steps)), expected, rtol=1e-6)
+        np.testing.assert_allclose(epsilon(chosen, np.float32(steps)), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("count", [1, 2, 100])
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
 def test_a_spread_epsilon_is_the_same_on_average_and_differs_between_environments(count, share):
-    apart = commander.spread(settings(epsilon_spread=True), jnp.float32(share), num_envs=count)
+    apart = np.asarray(spread(settings(epsilon_spread=True), np.float32(share), num_envs=count))
     assert apart.shape == (count,) and len(set(apart.tolist())) == count and 0 <= apart.min() and apart.max() <= 1
     np.testing.assert_allclose(apart.mean(), share, rtol=1e-5)
     assert count < 100 or share > 0.5 or (apart.min() < 0.02 * share and apart.max() > 1.98 * share)
-    same = commander.spread(settings(epsilon_spread=False), jnp.float32(share), num_envs=count)
+    same = spread(settings(epsilon_spread=False), np.float32(share), num_envs=count)
     np.testing.assert_allclose(same, [share] * count, rtol=1e-6)
 
 
@@ -368,14 +386,14 @@ def slow_successors(mode, reaches, misses, active):
 
 @pytest.mark.parametrize("mode", ["any", "possible", "known"])
 def test_successors_by_mode(mode):
-    got = successors(mode, reaches=jnp.array(REACHES), misses=jnp.array(MISSES), active=jnp.array(ACTIVE))
+    got = follows(mode, reaches=REACHES, misses=MISSES, active=ACTIVE)
     greedy, explore = slow_successors(mode, REACHES, MISSES, ACTIVE)
     np.testing.assert_array_equal(got.greedy, greedy)
     np.testing.assert_array_equal(got.explore, explore)
 
 
 def test_known_falls_back_to_what_is_possible_where_nothing_is_known():
-    got = successors("known", reaches=jnp.array(REACHES), misses=jnp.array(MISSES), active=jnp.array(ACTIVE))
+    got = jax.device_get(follows("known", reaches=REACHES, misses=MISSES, active=ACTIVE))
     assert got.greedy[0].tolist() == [False, True, False, False, False]
     assert got.greedy[1].tolist() == [True, True, False, True, False]
     assert got.greedy[3].tolist() == [True, True, True, True, False]
@@ -383,64 +401,42 @@ def test_known_falls_back_to_what_is_possible_where_nothing_is_known():
 
 def test_a_goals_region_may_always_follow_itself():
     """Though others are known to be reachable from there, for choices and for what is to come."""
-    known = jnp.zeros((R, R), bool).at[:, 1].set(True)
-    allowed = Successors(greedy=known, explore=known)
-    state = CommanderState(q=jnp.zeros((R, R, R)).at[..., 0].set(1.0), chosen=jnp.zeros(R))
-    many, key = jnp.zeros(300, jnp.int32), jax.random.key(0)
-    for there, greedy, random in ((many, {0}, {0, 1}), (many + 2, {1}, {1})):
-        assert set(choose(state, allowed, many, there, epsilon=0.0, key=key).tolist()) == greedy
-        assert set(choose(state, allowed, many, there, epsilon=1.0, key=key).tolist()) == random
-    for there, practised, greedy in ((many, many + 3, {1}), (many + 3, many, {0})):  # what is practised is the goal
-        chosen = choose(state, allowed, many, there, practised=practised, epsilon=0.0, key=key)
-        assert set(chosen.tolist()) == greedy
-    worth, targets = values.towards(state, allowed, jnp.int32(0))
+    onto = np.tile(np.arange(R) == 1, (R, 1))
+    allowed, q = Successors(greedy=onto, explore=onto), np.zeros((R, R, R), np.float32)
+    q[..., 0] = 1.0
+    state = CommanderState(q=q, chosen=np.zeros(R, np.float32))
+    for there, greedy, random in ((0, {0}, {0, 1}), (2, {1}, {1})):
+        assert set(choose(state, allowed, 0, there, epsilon=0.0).tolist()) == greedy
+        assert set(choose(state, allowed, 0, there, epsilon=1.0).tolist()) == random
+    for there, practised, greedy in ((0, 3, {1}), (3, 0, {0})):  # what is practised is the goal
+        assert set(choose(state, allowed, 0, there, practised=practised, epsilon=0.0).tolist()) == greedy
+    worth, targets = towards(state, allowed, 0)
     assert worth.tolist() == [1.0, *[0.0] * (R - 1)] and targets.tolist() == [0, *[1] * (R - 1)]
 
 
 def test_the_greedy_choice_is_the_best_allowed_target_and_ties_break_at_random():
-    q = jnp.zeros((R, R, R)).at[0, 1].set(jnp.array([0.0, 3.0, 9.0, 3.0, 1.0]))
-    allowed = jnp.ones((R, R), bool).at[:, 2].set(False)
-    many = jnp.zeros(500, jnp.int32)
-    targets = choose(
-        CommanderState(q=q, chosen=jnp.zeros(R)),
-        Successors(greedy=allowed, explore=allowed),
-        many,
-        many + 1,
-        epsilon=0.0,
-        key=jax.random.key(0),
-    )
-    chosen, counts = np.unique(targets, return_counts=True)
+    q, allowed = np.zeros((R, R, R), np.float32), np.tile(np.arange(R) != 2, (R, 1))
+    q[0, 1] = [0.0, 3.0, 9.0, 3.0, 1.0]
+    state = CommanderState(q=q, chosen=np.zeros(R, np.float32))
+    chosen, counts = np.unique(choose(state, Successors(allowed, allowed), 0, 1, epsilon=0.0), return_counts=True)
     assert chosen.tolist() == [1, 3]
-    assert counts.min() > 150
+    assert counts.min() > 0.3 * counts.sum()
 
 
 def test_epsilon_is_the_share_of_random_choices():
-    q = jnp.zeros((R, R, R)).at[..., 0].set(1.0)
-    allowed = jnp.ones((R, R), bool)
-    many = jnp.zeros(4000, jnp.int32)
-    targets = choose(
-        CommanderState(q=q, chosen=jnp.zeros(R)),
-        Successors(greedy=allowed, explore=allowed),
-        many,
-        many,
-        epsilon=0.5,
-        key=jax.random.key(0),
-    )
-    shares = np.bincount(targets, minlength=R) / 4000
+    q = np.zeros((R, R, R), np.float32)
+    q[..., 0] = 1.0
+    state = CommanderState(q=q, chosen=np.zeros(R, np.float32))
+    shares = np.bincount(choose(state, EVERYTHING, 0, 0, epsilon=0.5), minlength=R) / 4000
     np.testing.assert_allclose(shares, [0.6, 0.1, 0.1, 0.1, 0.1], atol=0.03)
 
 
 def test_who_practises_pursues_its_region_by_the_chances_to_reach_it():
-    chosen = settings(learner="model")
-    everything = Successors(jnp.ones((R, R), bool), jnp.ones((R, R), bool))
-    state = commander.init(chosen, regions=R)
-    state = state.replace(
-        q=state.q.at[0, 1, 2].set(1.0), model=state.model.replace(reach=state.model.reach.at[0, 3, 4].set(1.0))
-    )
-    zeros = jnp.zeros(2, jnp.int32)
-    practised = jnp.array([-1, 3])
-    targets = choose(state, everything, zeros, zeros + 1, practised=practised, epsilon=0.0, key=jax.random.key(0))
-    assert targets.tolist() == [2, 4]
+    state = begun(settings(learner="model"))
+    q, reach = state.q.copy(), state.model.reach.copy()
+    q[0, 1, 2] = reach[0, 3, 4] = 1.0
+    state = state.replace(q=q, model=state.model.replace(reach=reach))
+    assert choose(state, EVERYTHING, 0, 1, practised=[-1, 3], epsilon=0.0, n=2).tolist() == [2, 4]
 
 
 @pytest.mark.parametrize("reward", ["max", "mean"])
@@ -449,13 +445,13 @@ def test_the_reward_of_a_period_is_the_max_or_mean_over_all_its_steps(reward):
     external = -np.random.default_rng(0).random((3, 10, 4)).astype(np.float32)
     alive = np.ones((3, 10, 4), np.float32)
     alive[2, 6:, 1] = 0
-    total = jnp.full(4, commander.start_reward(chosen))
+    total, accumulate = np.full(4, commander.start_reward(chosen), np.float32), jax.jit(commander.accumulate)
     for part in range(3):
-        total = commander.accumulate(chosen, total, external[part], alive[part])
+        total = accumulate(chosen, total, external[part], alive[part])
     for b in range(4):
         lived = [external[p, t, b] for p in range(3) for t in range(10) if alive[p, t, b]]
         expected = max(lived) if reward == "max" else sum(lived) / 30
-        np.testing.assert_allclose(total[b], expected, rtol=1e-5)
+        np.testing.assert_allclose(np.asarray(total)[b], expected, rtol=1e-5)
 
 
 # Regions 0, 1, 2 become 0, 1, 2 and 3, of which 1 and 3 were cut from 1; region 4 is not in use.
@@ -520,24 +516,24 @@ def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
         goal_region=goal_region,
         target=np.where(batch.at_goal, goal_region, batch.target),
     )
-    q, visits, rewards, reach, *led = np.array(jax.random.uniform(jax.random.key(seed), (6, R, R, R)) * 3)
+    q, visits, rewards, reach, *led = 3 * np.random.default_rng(seed).random((6, R, R, R), np.float32)
     led, lost = np.stack(led), np.stack([visits[0], rewards[0]])
     led[:, :, :, 3:] = led[:, 3:] = led[:, :, 3:] = 0  # nothing there
     earlier = Model(led=led, rewards=rewards, visits=visits, lost=lost, reach=reach)
     traffic = np.random.default_rng(seed).integers(0, 3, (R, R)).astype(np.float32)
-    model = recounted(chosen, earlier, batch, cells, jnp.array(ORIGIN), traffic)
+    model = recounted(chosen, earlier, batch, cells, np.array(ORIGIN), traffic)
     for name, table in slow_recount(batch, cells, earlier, traffic, prior=2.0).items():
         np.testing.assert_allclose(getattr(model, name), table, rtol=1e-5, atol=1e-6)
 
-    boxes = regions.create(((0.0, 0.0), (5.0, 1.0)), ((1.0, 2.0, 3.0, 4.0), ()), max_regions=R)
+    boxes = jax.device_get(regions.create(((0.0, 0.0), (5.0, 1.0)), ((1.0, 2.0, 3.0, 4.0), ()), max_regions=R))
     centre = lambda region: (boxes.lower + boxes.upper)[region] / 2  # noqa: E731
     decisions = batch.replace(goal=centre(cells.goal_region))
     where = centre(cells.region), centre(cells.next_region)
     finished = Finished(decisions, Outcome(where[0], where[0], where[0], where[1], batch.weight))
-    state = CommanderState(q=jnp.array(q), chosen=jnp.arange(1.0, R + 1), model=earlier.replace(reach=reach + 1))
-    change = Change(before=boxes, after=boxes, splits=None, origin=jnp.array(ORIGIN))
+    state = CommanderState(q=q, chosen=np.arange(1, R + 1, dtype=np.float32), model=earlier.replace(reach=reach + 1))
+    change = Change(before=boxes, after=boxes, splits=None, origin=np.array(ORIGIN))
     began = state.replace(model=earlier)
-    after = jax.jit(commander.follow)(chosen, state, change, began, finished, traffic)
+    after = jax.device_get(follow(chosen, state, change, began, finished, traffic))
     jax.tree.map(np.testing.assert_array_equal, after.model.replace(reach=0), model.replace(reach=0))
     cube = np.ix_(ORIGIN, ORIGIN, ORIGIN)
     np.testing.assert_array_equal(after.q, q[cube])
@@ -547,36 +543,38 @@ def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
 
 def test_without_cuts_counting_anew_changes_nothing():
     chosen, batch = settings(learner="model"), random_batch(0)
-    before = commander.init(chosen, regions=R)
+    before = begun(chosen)
     model = counted(chosen, before, batch).model
-    again = recounted(chosen, before.model, batch, batch, jnp.arange(R), jnp.zeros((R, R)))
+    again = recounted(chosen, before.model, batch, batch, np.arange(R), np.zeros((R, R), np.float32))
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6), again, model)
 
 
 def test_who_began_beyond_the_cut_tells_nothing_of_this_side():
     """A wall cuts region 1 in two: from part 3 region 2 is reached, from part 1 it is not, whatever was known."""
     chosen = settings(learner="model", prior=1.0)
-    began = counted(chosen, commander.init(chosen, regions=R), many(1, 2, 2, count=1000))
+    began = counted(chosen, begun(chosen), many(1, 2, 2, count=1000))
     join = partial(jax.tree.map, lambda *parts: np.concatenate(parts))
     batch = join(many(1, 2, 1), many(1, 2, 2))
     cells = join(many(1, 2, 1), many(3, 2, 2))
-    traffic = jnp.zeros((R, R)).at[1, 1].set(700.0).at[3, 2].set(1000.0)
-    after = recounted(chosen, began.model, batch, cells, jnp.array(ORIGIN), traffic)
+    traffic = np.zeros((R, R), np.float32)
+    traffic[1, 1], traffic[3, 2] = 700.0, 1000.0
+    after = recounted(chosen, began.model, batch, cells, np.array(ORIGIN), traffic)
     led = np.asarray(after.led)[0, :, 2]
     assert led[1, 2] / led[1].sum() < 0.02 and led[3, 2] / led[3].sum() > 0.98
 
 
 def test_nobody_practises_without_a_commander_or_in_greedy_episodes():
-    here, chosen, key = jnp.zeros((400, 2)), settings(practice=0.3), jax.random.key(0)
-    practising = lambda memory: float((memory.practice >= 0).mean())  # noqa: E731
-    assert practising(commander.begin(chosen, here, greedy=False, key=key)) == pytest.approx(0.3, abs=0.07)
-    assert practising(commander.begin(chosen, here, greedy=True, key=key)) == 0
-    assert practising(goal_only.begin(chosen, here, greedy=False, key=key)) == 0
+    def practising(level, **greedy):
+        begin = jax.jit(lambda key: level.begin(settings(practice=0.3), jnp.zeros((400, 2)), key=key, **greedy))
+        return float((np.asarray(begin(jax.random.key(0)).practice) >= 0).mean())
+
+    assert practising(commander, greedy=False) == pytest.approx(0.3, abs=0.07)
+    assert practising(commander, greedy=True) == practising(goal_only, greedy=False) == 0
 
 
 def test_the_value_towards_a_goal_is_that_of_the_best_allowed_target():
     state, allowed = random_state(3)
-    value, target = map(np.asarray, values.towards(state, allowed, jnp.asarray(2)))
+    value, target = map(np.asarray, towards(state, allowed, 2))
     q, greedy = np.asarray(state.q), np.asarray(allowed.greedy)
     for region in range(R):
         best = max((j for j in range(R) if greedy[region, j]), key=lambda j: q[region, 2, j])

@@ -1,5 +1,7 @@
 """The Tutor's view, subgoals, reward and off-policy correction."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,10 +44,10 @@ def task(indices=(0, 1), *, state_dim=3, radius=1.0, reach=None):
 
 @pytest.mark.parametrize("relative", [True, False])
 def test_it_sees_the_state_and_the_bounds_of_the_box(relative):
-    state, here = jnp.array([[1.0, 2.0, 7.0]]), jnp.array([[1.0, 2.0]])
-    box = Box(lower=jnp.array([[4.0, 4.0]]), upper=jnp.array([[8.0, 10.0]]))
-    obs = jnp.concatenate([state, 9 + here], axis=-1)  # the goal comes last, and is not seen
-    seen = tutor.observe(settings(relative_bounds=relative), task(), obs, box)
+    state, here = np.float32([[1.0, 2.0, 7.0]]), np.float32([[1.0, 2.0]])
+    box = Box(lower=np.float32([[4.0, 4.0]]), upper=np.float32([[8.0, 10.0]]))
+    obs = np.concatenate([state, 9 + here], axis=-1)  # the goal comes last, and is not seen
+    seen = jax.jit(partial(tutor.observe, settings(relative_bounds=relative), task()))(obs, box)
     bounds = [3, 2, 7, 8] if relative else [4, 4, 8, 10]
     np.testing.assert_array_equal(seen, [[1, 2, 7, *bounds]])
     np.testing.assert_array_equal(box.centre, [[6, 7]])
@@ -66,25 +68,29 @@ def test_a_box_around_a_goal_close_by_is_aimed_at_and_teaches_nothing(straight):
     """Half of the reach of (10, 5): the second box sticks out of it, the third is larger than one around a goal."""
     section, known = settings(straight=straight, ppo={"hidden": [4]}), task(reach=(10.0, 5.0))
     margin = float(known.goal_margin)
-    obs = jnp.tile(jnp.array([1.0, 2.0, 7.0, 0.0, 0.0]), (3, 1))
-    centre = jnp.array([[5.0, 3.0], [5.0, 4.1], [5.0, 3.0]])
-    box = Box.around(centre, jnp.array([[margin], [margin], [1.2 * margin]]))
-    state, marks = tutor.init(jax.random.key(0), section, known), Marks()
-    choice = tutor.act(section, known, state, obs, box, marks, explore=True, key=jax.random.key(1))
+    obs = np.tile(np.float32([1.0, 2.0, 7.0, 0.0, 0.0]), (3, 1))
+    centre = np.float32([[5.0, 3.0], [5.0, 4.1], [5.0, 3.0]])
+    box = Box.around(centre, np.float32([[margin], [margin], [1.2 * margin]]))
+
+    @jax.jit
+    def played(key):
+        state, marks, steps = tutor.init(key, section, known), Marks(), jnp.zeros((L, 3))
+        choice = tutor.act(section, known, state, jnp.asarray(obs), box, marks, explore=True, key=key)
+        passed = Segment(
+            obs=jnp.stack([obs] * (L + 1)), seen=(), subgoal=(), action=steps, terminated=steps, ended=steps,
+            success=steps, distance=steps, alive=steps + 1, non_finite=steps, overflow=steps, box=box, choice=choice,
+        )  # fmt: skip
+        return choice, tutor.experience(section, known, passed, marks, renewed=jnp.zeros(3, bool))
+
+    choice, learnt = jax.device_get(played(jax.random.key(0)))
     aimed = np.linalg.norm(choice.subgoal - (box.centre - obs[:, :2]), axis=1) < 1e-6
     assert aimed.tolist() == [straight, False, False]
-    steps = jnp.zeros((L, 3))
-    passed = Segment(
-        obs=jnp.stack([obs] * (L + 1)), seen=(), subgoal=(), action=steps, terminated=steps, ended=steps, success=steps,
-        distance=steps, alive=steps + 1, non_finite=steps, overflow=steps, box=box, choice=choice,
-    )  # fmt: skip
-    learnt = tutor.experience(section, known, passed, marks, renewed=jnp.zeros(3, bool))
     np.testing.assert_array_equal(learnt.weight, [0.0 if straight else 1.0, 1.0, 1.0])
 
 
 def test_subgoals_are_clipped_to_their_scale():
-    actions = jnp.array([[0.5, -0.5], [3.0, -3.0]])
-    np.testing.assert_allclose(tutor.subgoal(actions, jnp.asarray(SCALE)), [[5, -2.5], [10, -5]])
+    actions = np.float32([[0.5, -0.5], [3.0, -3.0]])
+    np.testing.assert_allclose(jax.jit(tutor.subgoal)(actions, SCALE), [[5, -2.5], [10, -5]])
 
 
 @pytest.mark.parametrize("reward", ["distance", "progress"])
@@ -92,7 +98,7 @@ def test_the_reward_adds_up_the_steps_before_the_end(reward):
     rng = np.random.default_rng(0)
     distances = rng.random((L + 1, N)).astype(np.float32)
     alive = (np.arange(L)[:, None] < np.array([0, 1, 2, 3, 4, 4])).astype(np.float32)
-    got = tutor.reward(settings(reward=reward, reward_scale=0.1), distances, alive)
+    got = np.asarray(jax.jit(tutor.reward)(settings(reward=reward, reward_scale=0.1), distances, alive))
     for n in range(N):
         steps = [t for t in range(L) if alive[t, n]]
         if reward == "distance":
@@ -144,7 +150,7 @@ def test_the_correction_keeps_the_candidate_that_makes_the_actions_most_likely(c
     rng = np.random.default_rng(1)
     batch = replayed(rng, rng.uniform(-1, 1, (N, 2)).astype(np.float32))
     key = jax.random.key(0)
-    got = correct(batch, key)
+    got = jax.device_get(correct(batch, key))
     moved = (batch.extras.achieved[:, -1] - batch.extras.achieved[:, 0]) / SCALE
     drawn = moved + 0.5 * np.asarray(jax.random.normal(key, (10, N, 2)))
     changed = 0
@@ -163,6 +169,6 @@ def test_the_stored_subgoal_is_kept_where_it_explains_the_actions_best(correct):
     batch = replayed(rng, action)
     path = batch.extras.achieved
     subgoals = action[:, None] * SCALE + path[:, :1] - path[:, :-1]
-    done = np.asarray(mean_action(batch.extras.states, subgoals))
+    done = np.asarray(jax.jit(mean_action)(batch.extras.states, subgoals))
     batch = batch.replace(extras=batch.extras.replace(actions=done))
     np.testing.assert_allclose(correct(batch, jax.random.key(0)).action, action, atol=1e-6)

@@ -47,15 +47,15 @@ def rollout(rng, epoch):
     return Transition(numbers(5), numbers(2), zero, numbers(5), lost, zero, alive, extras=track)
 
 
-EXAMPLE = jax.tree.map(lambda x: jnp.asarray(x[0, 0]), rollout(np.random.default_rng(0), 0))
+EXAMPLE = jax.tree.map(lambda x: x[0, 0], rollout(np.random.default_rng(0), 0))
 
 
 def filled(rng, kept, rollouts):
     """A buffer of what is `kept` of each transition, and its steps [ENVS] in order of time; two rollouts an epoch."""
-    ring, steps = replay.create(kept(EXAMPLE), size=CAPACITY), []
+    ring, steps, add = replay.create(kept(EXAMPLE), size=CAPACITY), [], jax.jit(replay.add)
     for number in range(rollouts):
         one = kept(rollout(rng, epoch=number // 2))
-        ring = replay.add(ring, replay.flatten(one))
+        ring = add(ring, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), one))
         steps += [jax.tree.map(lambda x, t=t: x[t], one) for t in range(LENGTH)]
     return ring, steps
 

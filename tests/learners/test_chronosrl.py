@@ -36,7 +36,9 @@ def settings(**values):
 
 
 SIZES = {"batch_size": 64, "buffer_size": 1536}  # the same twice: compiled once
+# Compiled once, not each time that a test calls them.
 INIT = jax.jit(partial(chronosrl.init, example=EXAMPLE))
+NLL, COST = jax.jit(chronosrl.nll), jax.jit(chronosrl.cost)
 LOGITS = st_numpy.arrays(np.float32, (3, HORIZON + 1), elements=st.floats(-9, 9, width=32))
 
 
@@ -54,13 +56,13 @@ def slow_chances(logits):
 @given(LOGITS, st.floats(0.5, 0.999))
 def test_hazards_make_a_distribution_of_arrivals_and_their_expected_cost(logits, discount):
     count = HORIZON + 2
-    rows = jnp.repeat(logits, count, axis=0)
-    told = np.exp(-np.asarray(chronosrl.nll(rows, jnp.tile(jnp.arange(count), 3)))).reshape(3, count)
+    rows, arrival = np.repeat(logits, count, axis=0), np.tile(np.arange(count, dtype=np.int32), 3)
+    told = np.exp(-np.asarray(NLL(rows, arrival))).reshape(3, count)
     chances = np.array([slow_chances(one) for one in logits])
     np.testing.assert_allclose(told, chances, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(told.sum(axis=1), 1, atol=1e-4)
     costs = [sum(discount**t for t in range(min(tau, HORIZON))) for tau in range(count)]
-    np.testing.assert_allclose(chronosrl.cost(logits, discount=discount), chances @ costs, rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(COST(logits, discount=discount), chances @ costs, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize("horizon", [1, 2, 7, 50, 1000])
@@ -94,8 +96,8 @@ def slow_outcome(away, left, ends, *, radius):
     st.booleans(),
 )
 def test_arrival_and_occupancy_are_counted_within_the_episode(away, left, ends):
-    found = OUTCOME(away[None], jnp.asarray([left]), jnp.asarray([float(ends)]))
-    arrival, occupancy, seen = (np.asarray(x[0]) for x in found)
+    found = jax.device_get(OUTCOME(away[None], np.int32([left]), np.float32([ends])))
+    arrival, occupancy, seen = (x[0] for x in found)
     wanted, inside = slow_outcome(away, left, ends, radius=0.5)
     assert arrival == wanted
     assert set(np.flatnonzero(seen)) == inside.keys()
@@ -113,10 +115,14 @@ def test_chunks_goals_and_what_came_of_them_are_of_one_episode(chunk=3):
         float(steps[t].obs[b, 0]): (b, steps[t : t + n + 1]) for (t, b), n in np.ndenumerate(slow_left(steps))
     }
     possible = {first for first, (_, episode) in episodes.items() if len(episode) > least}
-    draw = jax.jit(lambda key: chronosrl._drawn(chosen, ring, Future.of(ring, num_envs=ENVS, least=least), key))
+
+    @jax.jit
+    def draw(ring, key):
+        return chronosrl._drawn(chosen, ring, Future.of(ring, num_envs=ENVS, least=least), key)
+
     seen, kinds = set(), np.zeros(3)
     for number in range(8):
-        batch = jax.device_get(draw(jax.random.key(number)))
+        batch = jax.device_get(draw(ring, jax.random.key(number)))
         assert batch.weight.all()
         for i, first in enumerate(batch.obs[:, 0].tolist()):
             b, episode = episodes[first]
@@ -141,7 +147,7 @@ def test_chunks_goals_and_what_came_of_them_are_of_one_episode(chunk=3):
 def test_the_critics_losses_are_those_of_the_equations():
     chosen = settings(**SIZES, discount=0.9)
     rng, n, count = np.random.default_rng(3), 16, chronosrl.bins(HORIZON)[-1] + 1
-    critic = INIT(jax.random.key(1), chosen).params["critic"]
+    critic = jax.device_get(INIT(jax.random.key(1), chosen).params["critic"])
     arrival, weight = rng.integers(0, HORIZON + 2, n), (rng.random(n) < 0.8).astype(float)
     batch = chronosrl.Batch(
         obs=rng.normal(size=(n, 5)),
@@ -153,12 +159,16 @@ def test_the_critics_losses_are_those_of_the_equations():
         ends=np.zeros(n),
         weight=weight,
     )
-    (loss, told), outlook = jax.jit(
-        lambda batch: (
+    batch = jax.tree.map(lambda x: np.asarray(x, np.int32 if x is arrival else np.float32), batch)
+
+    @jax.jit
+    def judged(critic, batch):
+        return (
             chronosrl._critic_loss(chosen, critic, batch),
             chronosrl._predicted(chosen, critic, batch, batch.action),
         )
-    )(jax.tree.map(jnp.asarray, batch))
+
+    (loss, told), outlook = jax.device_get(judged(critic, batch))
     phi, psi, hazard, occupancy = map(np.float64, outlook)
     step, surprise, time, apart, cross = -np.log(0.9), [], [], [], []
     for i in np.flatnonzero(weight):
@@ -195,7 +205,7 @@ def random(example):
     def filled(x):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             return key
-        return jnp.asarray(rng.normal(size=x.shape[1:]) * (x.dtype == jnp.float32), x.dtype)
+        return np.asarray(rng.normal(size=x.shape[1:]) * (x.dtype == np.float32), x.dtype)
 
     return jax.tree.map(filled, example)
 
@@ -207,14 +217,18 @@ def test_a_chunk_is_played_whatever_is_seen_and_also_by_who_acts_from_observatio
     state = random(program.example())
     key = program.evaluation_keys(0, stream=programs.AFTERWARDS)[0]
     keep = lambda env, subgoal, box, action: (env.obs, subgoal, action)  # noqa: E731
-    _, (obs, subgoal, played) = jax.jit(partial(play.greedy, hyper, spec, env, record=keep))(state, key=key)
     agent = levels.of(hyper, spec, greedy=True)
-    seen = hierarchy.observe(agent, obs, subgoal)[::2]
-    decided = jax.jit(agent.controller.act, static_argnames="explore")(
-        hyper.controller, state.controller, seen, explore=False, key=key
-    )
+
+    @jax.jit
+    def greedy(state, key):
+        _, (obs, subgoal, played) = play.greedy(hyper, spec, env, state, record=keep, key=key)
+        seen = hierarchy.observe(agent, obs, subgoal)[::2]
+        decided = agent.controller.act(hyper.controller, state.controller, seen, explore=False, key=key)
+        return obs, played, decided
+
+    obs, played, decided = jax.device_get(greedy(state, key))
     for t in range(12):  # in the first half of what was decided, or in the second, for each of two bodies
-        np.testing.assert_allclose(played[t], np.split(np.asarray(decided[t // 2]), 2, axis=1)[t % 2], atol=1e-5)
+        np.testing.assert_allclose(played[t], np.split(decided[t // 2], 2, axis=1)[t % 2], atol=1e-5)
     trained = acting.TrainedAgent(program, state, run_dir=tmp_path, env_steps=0, seed=program.seeds[0])
     for step in range(12):
         np.testing.assert_array_equal(trained.act(obs[step]), played[step])

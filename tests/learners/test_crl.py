@@ -1,7 +1,8 @@
 """Contrastive RL: which goals it draws, what its critic is told, and learning on the smallest of tasks."""
 
+from functools import partial
+
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import stats
@@ -20,11 +21,21 @@ def settings(**values):
     return parsed(**values).controller.crl
 
 
+init = jax.jit(partial(crl.init, example=EXAMPLE))
+steps_left = jax.jit(partial(futures.steps_left, num_envs=ENVS))
+
+
+@jax.jit
+def drawn(chosen, ring, key):
+    """A batch and its goals."""
+    return crl._drawn(chosen, ring, Future.of(ring, num_envs=ENVS), key)
+
+
 @pytest.mark.parametrize("rollouts", [1, 3, 4, 7])
 def test_goals_lie_ahead_in_the_same_episode_also_where_the_buffer_has_begun_anew(rollouts):
     ring, steps = filled(np.random.default_rng(rollouts), Step.of, rollouts)
     kept = steps[-4 * LENGTH :]
-    found = np.asarray(futures.steps_left(ring, num_envs=ENVS)).reshape(-1, ENVS)
+    found = np.asarray(steps_left(ring)).reshape(-1, ENVS)
     first = len(steps) % (4 * LENGTH) if len(steps) > len(kept) else 0
     np.testing.assert_array_equal(np.roll(found, -first, axis=0)[: len(kept)], slow_left(kept))
     assert not found[len(kept) :].any() and found.max() > 2
@@ -38,12 +49,11 @@ def test_it_draws_every_step_that_another_follows_and_its_goal_from_the_steps_th
         float(steps[t].obs[b, 0]): {tuple(steps[t + n].track.place[b]) for n in range(1, left[t, b] + 1)}
         for t, b in np.argwhere(left)
     }
-    draw = jax.jit(lambda key: crl._drawn(chosen, ring, Future.of(ring, num_envs=ENVS), key))
     seen = set()
     for number in range(10):
-        batch, goal = draw(jax.random.key(number))
+        batch, goal = jax.device_get(drawn(chosen, ring, jax.random.key(number)))
         assert batch.weight.all()
-        for first, place in zip(batch.obs[:, 0].tolist(), np.asarray(goal), strict=True):
+        for first, place in zip(batch.obs[:, 0].tolist(), goal, strict=True):
             assert tuple(place) in goals[first]
             seen.add(first)
     assert seen == goals.keys()
@@ -51,13 +61,13 @@ def test_it_draws_every_step_that_another_follows_and_its_goal_from_the_steps_th
 
 def test_a_buffer_in_which_nothing_follows_gives_a_batch_without_weight():
     ring = replay.create(Step.of(EXAMPLE), size=CAPACITY)
-    future = Future.of(ring, num_envs=ENVS)
-    assert not crl._drawn(settings(), ring, future, jax.random.key(0))[0].weight.any()
+    assert not np.asarray(drawn(settings(batch_size=96), ring, jax.random.key(0))[0].weight).any()
 
 
 def test_networks_begin_with_weights_as_small_as_those_of_jaxgcrl():
     """Its uniform weights have the variance 1 / 3n where a layer has n inputs."""
-    params = crl.init(jax.random.key(0), settings(hidden=[200, 200], representation=100), example=EXAMPLE).params
+    chosen = settings(hidden=[200, 200], representation=100)
+    params = jax.device_get(init(jax.random.key(0), chosen).params)
     for layers in (params["actor"], params["critic"]["action"], params["critic"]["goal"]):
         kernels = [layer["kernel"] for layer in layers["params"].values()]
         assert len(kernels) == 3
@@ -66,11 +76,12 @@ def test_networks_begin_with_weights_as_small_as_those_of_jaxgcrl():
 
 
 def test_how_far_goals_lie_ahead_is_geometric_and_cut_off_at_the_end():
-    uniform = jax.random.uniform(jax.random.key(0), (20_000,))
-    drawn = np.asarray(futures.ahead(jnp.full(uniform.shape, 5), uniform, discount=0.8))
+    uniform = np.random.default_rng(0).random(20_000, np.float32)
+    ahead = jax.jit(partial(futures.ahead, discount=0.8))
+    drawn = np.asarray(ahead(np.full(uniform.shape, 5), uniform))
     wanted = 0.8 ** np.arange(5)
     assert stats.chisquare(np.bincount(drawn, minlength=6)[1:], len(drawn) * wanted / wanted.sum()).pvalue > 1e-4
-    assert np.asarray(futures.ahead(jnp.zeros(3, int), uniform[:3], discount=0.8)).tolist() == [0, 0, 0]
+    assert not np.asarray(ahead(np.zeros(uniform.shape, int), uniform)).any()
 
 
 def slow_mlp(params, x):
@@ -83,26 +94,25 @@ def slow_mlp(params, x):
 
 def test_the_critic_tells_its_own_goal_from_those_of_others():
     chosen = settings(hidden=[8], representation=3, logsumexp_penalty=0.2)
-    state, rng = crl.init(jax.random.key(1), chosen, example=EXAMPLE), np.random.default_rng(2)
-    batch = jax.tree.map(lambda x: jnp.asarray(x[:, 0]), Step.of(rollout(rng, 0)))
-    batch = batch.replace(weight=jnp.asarray([1.0, 1, 0, 1, 1, 1]))
+    critic, rng = jax.device_get(init(jax.random.key(1), chosen).params["critic"]), np.random.default_rng(2)
+    batch = jax.tree.map(lambda x: x[:, 0], Step.of(rollout(rng, 0)))
+    batch = batch.replace(weight=np.float32([1, 1, 0, 1, 1, 1]))
     goal = rng.normal(size=(LENGTH, 2)).astype(np.float32)
-    critic, obs = state.params["critic"], np.float64(batch.obs)
-    lost = []
+    obs, lost = np.float64(batch.obs), []
     for i in range(LENGTH):
         phi = slow_mlp(critic["action"], np.concatenate([obs[i, :3], batch.action[i]]))
         energy = [-np.sqrt(((phi - slow_mlp(critic["goal"], g)) ** 2).sum() + 1e-6) for g in goal]
         total = np.log(np.exp(energy).sum())
         lost.append(total - energy[i] + 0.2 * total**2)
-    loss, _ = crl._critic_loss(chosen, critic, batch, jnp.asarray(goal))
+    loss, _ = jax.jit(crl._critic_loss)(chosen, critic, batch, goal)
     assert float(loss) == pytest.approx(np.mean(np.delete(lost, 2)), rel=1e-4)
 
 
 def test_it_learns_to_go_to_goals_that_no_reward_tells_of():
     chosen = settings(
-        hidden=[32], batch_size=128, buffer_size=1536, updates_per_rollout=40, learning_rate=3e-3, discount=0.8
+        hidden=[32], batch_size=64, buffer_size=1536, updates_per_rollout=30, learning_rate=5e-3, discount=0.8
     )
-    assert np.median(places.cosines(crl, chosen, rollouts=9)) > 0.9
+    assert np.median(places.cosines(crl, chosen, rollouts=5)) > 0.9
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """TD3: when it updates, what its critics aim at, and learning on the smallest of tasks."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,7 @@ def settings(**values):
         "hidden": [8],
         "batch_size": 16,
         "buffer_size": 64,
-        "min_transitions": 8,
+        "min_transitions": 16,
         "updates_per_rollout": 1,
         "tau": 0.1,
     } | values
@@ -24,36 +26,44 @@ def settings(**values):
     return loading.parse({"controller": {"learner": "td3", "td3": values}, **small}).controller.td3
 
 
-EXAMPLE = Transition(
-    obs=jnp.zeros(3),
-    action=jnp.zeros(2),
-    reward=jnp.zeros(()),
-    next_obs=jnp.zeros(3),
-    terminated=jnp.zeros(()),
-    cut=jnp.zeros(()),
-    weight=jnp.zeros(()),
-)
-
-
-def random_rollout(n, seed=0):
-    """[1, n] transitions."""
+def random_rollout(seed=0, n=16):
+    """[1, n] transitions; as many in all tests, so that an update is compiled once."""
     rng = np.random.default_rng(seed)
     f32 = lambda *shape: rng.uniform(-1, 1, shape).astype(np.float32)  # noqa: E731
     zero, one = np.zeros((1, n), np.float32), np.ones((1, n), np.float32)
     return Transition(f32(1, n, 3), f32(1, n, 2), f32(1, n), f32(1, n, 3), zero, zero, one)
 
 
+EXAMPLE = jax.tree.map(lambda x: 0 * x[0, 0], random_rollout())
+
+
 @pytest.fixture(scope="module")
 def start():
     state = jax.jit(lambda key: td3.init(key, settings(), example=EXAMPLE))(jax.random.key(0))
-    state = state.replace(params=jax.tree.map(lambda p: 4 * p, state.params))  # critics that begin flat tell little
+    begun = jax.device_get((state.params, state.target))
+    params = jax.tree.map(lambda p: 4 * p, begun[0])  # critics that begin flat tell little
     # Targets unlike the networks show that they are used, and how they move.
-    return state.replace(target=jax.tree.map(lambda p: 0.5 * p + 0.1, state.target))
+    return state.replace(params=params, target=jax.tree.map(lambda p: 0.5 * p + np.float32(0.1), begun[1]))
 
 
 @pytest.fixture(scope="module")
 def update():
-    return jax.jit(lambda chosen, state, rollout, key: td3.update(chosen, state, rollout, key=key))
+    """An update from batches with so much `more` reward."""
+
+    @jax.jit
+    def run(chosen, state, rollout, key, more):
+        relabel = lambda batch, key: batch.replace(reward=batch.reward + more)  # noqa: E731
+        return td3.update(chosen, state, rollout, relabel=relabel, key=key)
+
+    def call(chosen, state, rollout, seed=1, more=0.0):
+        return jax.device_get(run(chosen, state, rollout, jax.random.key(seed), more))
+
+    return call
+
+
+@partial(jax.jit, static_argnames="deterministic")
+def act(chosen, state, obs, seed, *, deterministic=False):
+    return td3.act(chosen, state, obs, deterministic=deterministic, key=jax.random.key(seed))
 
 
 def slow_mlp(params, x):
@@ -74,10 +84,10 @@ def test_the_critics_aim_at_the_smaller_target_and_do_not_bootstrap_past_a_termi
     start, update, terminated, scale
 ):
     chosen = settings(target_noise=0.0, discount=0.9)
-    known = Normalizer(mean=jnp.array([0.1, -0.2, 0.3]), variance=jnp.array([0.5, 1.0, 2.0]), count=jnp.array(1e9))
-    one = random_rollout(1)
-    paid = Normalizer(mean=jnp.array([0.3]), variance=jnp.array([0.1]), count=jnp.array(1e9))
-    one = one.replace(reward=scale * one.reward, terminated=np.full((1, 1), terminated, np.float32))
+    known = Normalizer(mean=np.float32([0.1, -0.2, 0.3]), variance=np.float32([0.5, 1.0, 2.0]), count=np.float32(1e9))
+    one = random_rollout(n=1)
+    paid = Normalizer(mean=np.float32([0.3]), variance=np.float32([0.1]), count=np.float32(1e9))
+    one = one.replace(reward=np.float32(scale) * one.reward, terminated=np.full((1, 1), terminated, np.float32))
     rollout = jax.tree.map(lambda x: np.repeat(x, 16, axis=1), one)  # any batch is made of this one
     unit = np.sqrt((0.3**2 + 0.1) / (1 - 0.9**2))  # deviation of a sum of discounted independent rewards
     action, reward = np.float64(one.action[0, 0]), np.float64(one.reward[0, 0]) / unit
@@ -90,25 +100,24 @@ def test_the_critics_aim_at_the_smaller_target_and_do_not_bootstrap_past_a_termi
     errors = [abs(q - goal) for q in slow_qs(start.params["critic"], obs, action)]
     expected = sum(error**2 / 2 if error < 1 else error - 0.5 for error in errors)
     assert (min(errors) > 1) == (scale > 1), "both parts of the loss are seen"
-    _, metrics = update(chosen, start.replace(normalizer=known, rewards=paid), rollout, jax.random.key(1))
+    _, metrics = update(chosen, start.replace(normalizer=known, rewards=paid), rollout)
     np.testing.assert_allclose(metrics["critic_loss"], expected, rtol=1e-4)
 
 
 def test_there_is_no_update_before_enough_transitions(start, update):
-    state, _ = update(settings(), start, random_rollout(7), jax.random.key(1))
-    assert int(state.updates) == 0 and int(replay.filled(state.ring)) == 7
+    state, _ = update(settings(min_transitions=17), start, random_rollout())
+    assert int(state.updates) == 0 and int(replay.filled(state.ring)) == 16
     same = {"ring": None, "normalizer": None, "rewards": None}
     jax.tree.map(np.testing.assert_array_equal, state.replace(**same), start.replace(**same))
-    np.testing.assert_allclose(state.normalizer.mean, random_rollout(7).obs[0].mean(axis=0), atol=1e-6)
-    state, _ = update(settings(), state, random_rollout(1), jax.random.key(1))
-    assert int(state.updates) == 1
+    np.testing.assert_allclose(state.normalizer.mean, random_rollout().obs[0].mean(axis=0), atol=1e-6)
+    assert int(update(settings(), start, random_rollout())[0].updates) == 1
 
 
 def test_actor_and_targets_move_every_second_update_and_targets_by_tau(start, update):
     changed = lambda a, b: any((x != y).any() for x, y in zip(*map(jax.tree.leaves, (a, b)), strict=True))  # noqa: E731
     before = start
     for step in range(4):
-        after, _ = update(settings(), before, random_rollout(8, seed=step), jax.random.key(step))
+        after, _ = update(settings(), before, random_rollout(seed=step), step)
         assert int(after.updates) == step + 1
         assert changed(after.params["critic"], before.params["critic"])
         moves = step % 2 == 0
@@ -124,58 +133,57 @@ def test_actor_and_targets_move_every_second_update_and_targets_by_tau(start, up
 
 
 def test_transitions_of_weight_0_have_no_influence(start, update):
-    rollout = random_rollout(16)
+    rollout = random_rollout()
     off = np.arange(16) % 2 == 1
     rollout = rollout.replace(weight=np.float32(~off)[None])
     spoilt = rollout.replace(reward=np.where(off, 1e3, rollout.reward).astype(np.float32))
-    (first, _), (second, _) = (update(settings(), start, r, jax.random.key(1)) for r in (rollout, spoilt))
+    (first, _), (second, _) = (update(settings(), start, r) for r in (rollout, spoilt))
     jax.tree.map(np.testing.assert_array_equal, first.params, second.params)
 
 
-def test_relabelling_applies_to_the_batches_but_not_to_the_buffer(start):
-    def relabel(batch, key):
-        return batch.replace(reward=batch.reward + 100.0)
-
-    run = jax.jit(lambda r, key: td3.update(settings(), start, r, relabel=relabel, key=key))
-    state, metrics = run(random_rollout(16), jax.random.key(1))
+def test_relabelling_applies_to_the_batches_but_not_to_the_buffer(start, update):
+    state, metrics = update(settings(), start, random_rollout(), more=100.0)
     assert float(metrics["critic_loss"]) > 50
-    assert float(jnp.abs(replay.contents(state.ring)[0].reward).max()) <= 1
+    assert np.abs(replay.contents(state.ring)[0].reward).max() <= 1
 
 
 def test_actions_stay_in_range_and_noise_is_for_exploration_only(start):
-    chosen = settings(exploration_noise=0.5)
-    obs = jnp.broadcast_to(jnp.array([1.0, -2.0, 0.5]), (3000, 3))
-    keys = jax.random.split(jax.random.key(0))
-    still = [td3.act(chosen, start, obs[0], deterministic=True, key=key) for key in keys]
+    chosen, later = settings(exploration_noise=0.5), start.replace(updates=np.int32(1))
+    obs = np.tile(np.float32([1.0, -2.0, 0.5]), (5000, 1))
+    still = [np.asarray(act(chosen, start, obs, seed, deterministic=True)) for seed in range(2)]
     np.testing.assert_array_equal(*still)
-    noisy = td3.act(chosen, start.replace(updates=1), obs, key=keys[0])
-    assert float(jnp.abs(noisy).max()) <= 1
-    np.testing.assert_allclose(jnp.clip(noisy, -0.9, 0.9).mean(0), still[0], atol=0.05)
+    noisy = np.asarray(act(chosen, later, obs, 0))
+    assert np.abs(noisy).max() <= 1
+    np.testing.assert_allclose(np.clip(noisy, -0.9, 0.9).mean(0), still[0][0], atol=0.05)
     assert (noisy.std(0) > 0.3).all()
 
 
 def test_of_many_environments_the_first_hardly_explore_and_the_last_do_twice_as_much_as_the_mean(start):
-    chosen, obs = settings(exploration_noise=0.1), jnp.zeros((4, 3))
-    keys = jax.random.split(jax.random.key(0), 2000)
-    still = td3.act(chosen, start, obs[0], deterministic=True, key=keys[0])
-    later = start.replace(updates=1)
-    noise = jax.vmap(lambda key: td3.act(chosen, later, obs, key=key))(keys) - still
-    np.testing.assert_allclose(noise.std(axis=(0, 2)), [0.025, 0.075, 0.125, 0.175], rtol=0.05)
-    alone = jax.vmap(lambda key: td3.act(chosen, later, obs[0], key=key))(keys) - still
+    chosen, obs = settings(exploration_noise=0.1), np.zeros((4, 3), np.float32)
+    later = start.replace(updates=np.int32(1))
+
+    @jax.jit
+    def noise(state, seeds):
+        still = td3.act(chosen, state, obs[0], deterministic=True, key=jax.random.key(0))
+        draw = lambda seed, obs: td3.act(chosen, state, obs, key=jax.random.key(seed)) - still  # noqa: E731
+        return [jax.vmap(draw, (0, None))(seeds, seen) for seen in (obs, obs[0])]
+
+    many, alone = jax.device_get(noise(later, np.arange(2000)))
+    np.testing.assert_allclose(many.std(axis=(0, 2)), [0.025, 0.075, 0.125, 0.175], rtol=0.05)
     np.testing.assert_allclose(alone.std(), 0.1, rtol=0.05)
 
 
 def test_before_the_first_update_actions_are_drawn_evenly_but_for_greedy_ones(start):
-    obs, key = jnp.ones((5000, 3)), jax.random.key(0)
-    drawn = td3.act(settings(), start, obs, key=key)
+    obs = np.ones((5000, 3), np.float32)
+    drawn = act(settings(), start, obs, 0)
     np.testing.assert_allclose(np.quantile(drawn, [0, 0.25, 0.5, 0.75, 1]), [-1, -0.5, 0, 0.5, 1], atol=0.03)
-    assert not np.ptp(td3.act(settings(), start, obs, deterministic=True, key=key), axis=0).any()
+    assert not np.ptp(act(settings(), start, obs, 0, deterministic=True), axis=0).any()
 
 
 def test_the_scale_of_rewards_does_not_matter(start, update):
-    rollout = random_rollout(16)
+    rollout = random_rollout()
     learnt = [
-        update(settings(), start, rollout.replace(reward=scale * rollout.reward), jax.random.key(1))[0].params
+        update(settings(), start, rollout.replace(reward=np.float32(scale) * rollout.reward))[0].params
         for scale in (2.0**-7, 1.0, 2.0**7)
     ]
     for other in (learnt[0], learnt[2]):
@@ -191,7 +199,8 @@ def test_it_learns_the_best_action_of_a_one_step_task():
         actor_learning_rate=3e-3,
         critic_learning_rate=3e-3,
     )
-    example = EXAMPLE.replace(obs=jnp.zeros(1), next_obs=jnp.zeros(1), action=jnp.zeros(1))
+    one = np.zeros(1, np.float32)
+    example = EXAMPLE.replace(obs=one, next_obs=one, action=one)
 
     def once(state, key):
         action_key, obs_key, update_key = jax.random.split(key, 3)
@@ -206,4 +215,4 @@ def test_it_learns_the_best_action_of_a_one_step_task():
         state, _ = jax.lax.scan(once, td3.init(key, chosen, example=example), jax.random.split(key, 40))
         return td3.act(chosen, state, jnp.array([[1.0], [-1.0]]), deterministic=True, key=key)
 
-    np.testing.assert_allclose(learn(jax.random.key(0))[:, 0], [0.5, -0.5], atol=0.15)
+    np.testing.assert_allclose(np.asarray(learn(jax.random.key(0)))[:, 0], [0.5, -0.5], atol=0.15)

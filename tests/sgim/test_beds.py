@@ -15,19 +15,31 @@ BLOCKS, EPISODES = 2400, 5
 AUTONOMOUS, PROCEDURE, TEACHER, BAD = range(4)
 
 
-def run(*, bed=None, costs=(1, 1, 1, 1), absent=(), sign=1.0, seeds=16):
-    """The courses of `seeds` learners, [seeds, blocks]; `sign` -1 tells them that they get worse when they learn."""
-    bed = bed or beds.six_regions()
-    rule = selectors.sgim(sgim.Config(), bed.regions, costs, jnp.array([s not in absent for s in range(4)]))
-    told = rule._replace(update=lambda state, r, s, goals, c: rule.update(state, r, s, goals, sign * c))
-    one = partial(beds.run, bed, told, blocks=BLOCKS, episodes=EPISODES)
-    course = jax.jit(jax.vmap(lambda key: one(key=key)))(jax.random.split(jax.random.key(0), seeds))
-    return jax.tree.map(np.asarray, course)
+@jax.jit
+def courses(keys, noise, gains, late_gains, costs, available, sign):
+    bed = beds.six_regions(noise=noise, gains=gains, late_gains=late_gains)
+    rule = selectors.sgim(sgim.Config(), bed.regions, [1.0] * 4, available)
+    told = rule._replace(
+        state=rule.state.replace(costs=costs),
+        update=lambda state, r, s, goals, c: rule.update(state, r, s, goals, sign * c),
+    )
+    return jax.vmap(lambda key: beds.run(bed, told, blocks=BLOCKS, episodes=EPISODES, key=key))(keys)
+
+
+def run(*, noise=0.0, gains=beds.GAINS, late_gains=None, costs=(1, 1, 1, 1), absent=(), sign=1.0):
+    """The courses of 16 learners, [seeds, blocks]; `sign` -1 tells them that they get worse when they learn."""
+    tables = np.float32(gains), np.float32(gains if late_gains is None else late_gains)
+    available = np.array([s not in absent for s in range(4)])
+    keys = jax.random.split(jax.random.key(0), 16)
+    return jax.device_get(courses(keys, noise, *tables, np.float32(costs), available, sign))
+
+
+MASTERED = jax.jit(jax.vmap(beds.until_mastered))
 
 
 def mastered(course):
     """Blocks until mastery, [seeds]."""
-    return np.asarray(jax.vmap(beds.until_mastered)(course))
+    return np.asarray(MASTERED(course))
 
 
 def share(course, *, region=None, strategy=None, until=None):
@@ -49,13 +61,14 @@ def quiet():
 
 def test_a_block_of_the_bed_is_that_of_a_loop():
     latent, plan = np.zeros(6), [(0, 2), (1, 0), (0, 0), (4, 1), (3, 2)]
-    region, strategy = jnp.array(plan).T
+    region, strategy = jnp.asarray(np.array(plan).T)
     fixed = selectors.Selector(
         state=jnp.int32(0),
         select=lambda state, *, key: (region[state], strategy[state]),
         update=lambda state, *_: state + 1,
     )
-    course = beds.run(beds.six_regions(), fixed, blocks=5, episodes=5, key=jax.random.key(0))
+    course = jax.jit(lambda key: beds.run(beds.six_regions(), fixed, blocks=5, episodes=5, key=key))(jax.random.key(0))
+    course = jax.device_get(course)
     for i, (r, s) in enumerate(plan):
         for _ in range(5):
             if r not in (1, 2) or latent[r - 1] > 0.7:
@@ -72,9 +85,14 @@ def test_goals_are_drawn_in_the_region_that_was_chosen():
         update=lambda state, *_: state + 1,
     )
     noted = bed._replace(play=lambda latent, r, s, goals, late, *, key: (goals, goals[:, 0]), start=jnp.zeros((5, 2)))
-    course = beds.run(noted._replace(mastery=lambda goals: goals[0, 0]), told, blocks=36, key=jax.random.key(0))
-    located = jax.vmap(jax.vmap(partial(regions.locate, bed.regions)))(course.latent)
-    np.testing.assert_array_equal(located, np.repeat(np.arange(36)[:, None], 5, axis=1))
+    noted = noted._replace(mastery=lambda goals: goals[0, 0])
+
+    @jax.jit
+    def located(key):
+        course = beds.run(noted, told, blocks=36, key=key)
+        return jax.vmap(jax.vmap(partial(regions.locate, bed.regions)))(course.latent)
+
+    np.testing.assert_array_equal(located(jax.random.key(0)), np.repeat(np.arange(36)[:, None], 5, axis=1))
 
 
 def test_it_practises_what_is_learnable_and_soon_masters_it(quiet):
@@ -84,7 +102,7 @@ def test_it_practises_what_is_learnable_and_soon_masters_it(quiet):
 
 
 def test_noise_on_competence_costs_little():
-    assert run(bed=beds.six_regions(noise=0.05)).mastery.mean() >= 0.84
+    assert run(noise=0.05).mastery.mean() >= 0.84
 
 
 def test_it_moves_on_when_something_is_mastered(quiet):
@@ -113,7 +131,7 @@ def test_an_expensive_teacher_is_asked_less_and_an_absent_one_never(quiet):
     expensive = run(costs=(1, 1, 10, 1))
     asked = [share(course, region=0, strategy=TEACHER, until=mastered(course)) for course in (quiet, expensive)]
     assert asked[1] < 0.7 * asked[0]
-    absent = run(absent=(TEACHER,), seeds=4)
+    absent = run(absent=(TEACHER,))
     assert not (absent.strategy == TEACHER).any()
     assert (absent.latent[:, -1, :3] > 0.8).all()
 
@@ -122,7 +140,7 @@ def test_it_recovers_when_teacher_and_procedure_swap_what_they_teach():
     """Half-way, with learning so slow that nothing is mastered by then."""
     gains = beds.GAINS / 12
     swapped = gains[:, [AUTONOMOUS, TEACHER, PROCEDURE, BAD]]
-    course = run(bed=beds.six_regions(gains=gains, late_gains=swapped))
+    course = run(gains=gains, late_gains=swapped)
     half = BLOCKS // 2
     assert (course.latent[:, half, 3] < 0.9).all()
     before = (course.region == 3) & (np.arange(BLOCKS) < half)

@@ -13,6 +13,8 @@ from star.abstraction import regions
 from star.abstraction.regions import Change, Cut, Split
 from star.agent import commander, levels, play, q_learning, tutor, values
 from star.agent.decisions import Decision, Roadmap, Scene, Successors
+from star.agent.segments import Segment
+from star.agent.values import CommanderState
 from star.config import loading
 from star.learners import ppo, td3
 from star.learners.replay import Imitation, Transition
@@ -27,37 +29,58 @@ B, L = 64, 3
 AIMS = {"name": "aims", "kind": "outcome", "source": "demos.npz"}
 
 
+OWN = ["autonomous", "babbling", "decomposition"]
+
+# Compiled once, not each time that a test calls them.
 assign = jax.jit(strategies.assign)
 learn = jax.jit(lessons.learn)
+impose = jax.jit(lessons.impose)
+grade = jax.jit(lessons.grade)
+ways = jax.jit(lessons.ways, static_argnames=("most", "parts"))
+choose = jax.jit(values.choose)
 
 
 @cache
 def four_regions():
-    return regions.create(((0.0, 0.0), (4.0, 4.0)), ((2.0,), (2.0,)), max_regions=6)
+    return jax.device_get(regions.create(((0.0, 0.0), (4.0, 4.0)), ((2.0,), (2.0,)), max_regions=6))
 
 
 def settings(**values):
     return SgimConfig.model_validate(values)
 
 
+def begun(config):
+    """Nothing practised yet in four regions, in NumPy."""
+    return jax.device_get(strategies.init(config, four_regions()))
+
+
+def put(array, index, values):
+    """A copy of `array` with other `values` at `index`."""
+    array = array.copy()
+    array[index] = values
+    return array
+
+
+@cache
+def shown(seed, length):
+    """What a teacher shows, in NumPy."""
+    return jax.device_get(demonstrations(seed, length=length))
+
+
 def lesson_of(config, state=None, *, taught=None, seed=0, teachers=None):
-    """An assigned lesson, what it was assigned for, and the state."""
+    """An assigned lesson, what it was assigned for, and the state, all in NumPy."""
     rng = np.random.default_rng(seed)
-    start, goal = (jnp.asarray(rng.uniform(0, 4, (B, 2)), jnp.float32) for _ in range(2))
-    state = strategies.init(config, four_regions()) if state is None else state
-    taught = jnp.ones(B, bool) if taught is None else taught
-    teachers = [demonstrations(i, length=i + 1) for i in range(len(config.teachers))] if teachers is None else teachers
+    start, goal = (rng.uniform(0, 4, (B, 2)).astype(np.float32) for _ in range(2))
+    state = begun(config) if state is None else state
+    taught = np.ones(B, bool) if taught is None else taught
+    teachers = [shown(i, i + 1) for i in range(len(config.teachers))] if teachers is None else teachers
     key = jax.random.key(seed)
-    return (
-        assign(config, state, teachers, start=start, goal=goal, taught=taught, key=key),
-        start,
-        goal,
-        state,
-    )
+    lesson = assign(config, state, teachers, start=start, goal=goal, taught=taught, key=key)
+    return jax.device_get(lesson), start, goal, state
 
 
 def located(point):
-    table = jax.device_get(four_regions())
+    table = four_regions()
     return next(
         j for j in range(4) if (table.lower[j] <= point).all() and ((point < table.upper[j]) | (point >= 4)).all()
     )
@@ -76,99 +99,95 @@ def test_nothing_is_kept_where_everything_is_left_as_ever(tiny, breaking_env):
 
 
 def test_goals_stay_those_of_the_task_unless_they_may_be_chosen():
-    lesson, _, goal, _ = lesson_of(settings(exploration=True))
+    lesson, _, goal, _ = lesson_of(settings(strategies=OWN))
     np.testing.assert_array_equal(lesson.choice.goal, goal)
-    assert lesson.choice.region.tolist() == [located(np.asarray(g)) for g in goal]
+    assert lesson.choice.region.tolist() == [located(g) for g in goal]
     chosen, _, goal, _ = lesson_of(settings(goals=True))
     assert not np.isclose(chosen.choice.goal, goal).all(axis=1).any()
-    assert chosen.choice.region.tolist() == [located(np.asarray(g)) for g in chosen.choice.goal]
+    assert chosen.choice.region.tolist() == [located(g) for g in chosen.choice.goal]
     assert set(chosen.choice.region.tolist()) == {0, 1, 2, 3}
 
 
 def test_each_teacher_shows_what_is_nearest_and_only_to_those_who_ask():
     config = settings(teachers=[GUIDE, AIMS, ACTS])
     lesson, start, goal, _ = lesson_of(config)
-    demos = [demonstrations(i, length=i + 1) for i in range(3)]
-    asked = np.asarray(lesson.choice.strategy)
+    demos = [shown(i, i + 1) for i in range(3)]
+    asked = lesson.choice.strategy
     assert set(asked) == {0, 1, 2, 3}
+    guides, aims, acts = jax.device_get(
+        jax.jit(lambda: [nearest(one, None if i == 1 else start, goal) for i, one in enumerate(demos)])()
+    )
     for b in range(B):
-        guide, aims, acts = (
-            int(nearest(shown, None if i == 1 else start[b], goal[b])) for i, shown in enumerate(demos)
-        )
-        expected = {2: demos[1].outcomes[aims], 3: demos[2].outcomes[acts]}.get(asked[b], goal[b])
+        expected = {2: demos[1].outcomes[aims[b]], 3: demos[2].outcomes[acts[b]]}.get(asked[b], goal[b])
         np.testing.assert_array_equal(lesson.choice.goal[b], expected)
         assert int(lesson.leg[b]) == (0 if asked[b] == 1 else L)
         if asked[b] == 1:
-            np.testing.assert_array_equal(lesson.waypoints[b], np.repeat(demos[0].waypoints[guide], L, axis=0))
+            np.testing.assert_array_equal(lesson.waypoints[b], np.repeat(demos[0].waypoints[guides[b]], L, axis=0))
     np.testing.assert_array_equal(lessons.guided(config, lesson), asked == 1)
 
 
 def test_own_decomposition_goes_by_way_of_what_is_mastered_best_in_a_region():
-    config = settings(strategies=["autonomous", "decomposition"])
-    state = strategies.init(config, four_regions())
-    competences = state.competences.at[1, :3].set(jnp.array([0.9, 0.2, 0.5]))
-    goals = state.goals.at[1, :3].set(jnp.array([[1.5, 3.5], [0.5, 2.5], [1.0, 3.0]]))
-    state = state.replace(competences=competences, goals=goals, written=state.written.at[1].set(3))
+    config = settings(strategies=OWN)
+    state = begun(config)
+    competences = put(state.competences, (1, slice(3)), [0.9, 0.2, 0.5])
+    goals = put(state.goals, (1, slice(3)), [[1.5, 3.5], [0.5, 2.5], [1.0, 3.0]])
+    state = state.replace(competences=competences, goals=goals, written=put(state.written, 1, 3))
     lesson = lesson_of(config, state)[0]
-    mine = np.asarray(lesson.choice.strategy) == 1
+    mine = lesson.choice.strategy == 2
     assert mine.any() and not mine.all()
-    via = np.array((state.abstraction.lower + state.abstraction.upper) / 2)[:4]
+    via = ((state.abstraction.lower + state.abstraction.upper) / 2)[:4]
     via[1] = [1.5, 3.5]  # of the others nothing is known: their centres
-    first = np.asarray(lesson.waypoints[:, 0])
+    first = lesson.waypoints[:, 0]
     assert all(any((point == one).all() for one in via) for point in first[mine])
     assert len(np.unique(first[mine], axis=0)) == 4
-    np.testing.assert_array_equal(np.asarray(lesson.leg) == 0, mine)
+    np.testing.assert_array_equal(lesson.leg == 0, mine)
     assert not lessons.guided(config, lesson).any()
 
 
 def test_own_decomposition_has_one_waypoint_however_many_teachers_show():
     config = settings(strategies=["autonomous", "decomposition"], teachers=[GUIDE])
-    lesson, *_ = lesson_of(config, teachers=[demonstrations(length=L)])
-    mine = np.asarray(lesson.choice.strategy) == 1
+    lesson, *_ = lesson_of(config, teachers=[shown(0, L)])
+    mine = lesson.choice.strategy == 1
     assert mine.any() and lesson.waypoints.shape[1] == L
-    there = np.asarray(lesson.waypoints[:, 0])
-    after, _, to_point = lessons.impose(config, lesson, jnp.asarray(there))
-    assert not to_point[mine].any() and (np.asarray(after.leg)[mine] == L).all()
+    after, _, to_point = jax.device_get(impose(config, lesson, lesson.waypoints[:, 0]))
+    assert not to_point[mine].any() and (after.leg[mine] == L).all()
 
 
 def test_no_teacher_is_asked_more_often_than_his_budget_and_none_who_is_away():
     config = settings(teachers=[{**GUIDE, "max_queries": 5}, {**AIMS, "availability": 0}])
-    taught = jnp.arange(B) % 4 > 0
+    taught = np.arange(B) % 4 > 0
     state, asked = None, 0
     for seed in range(3):
         lesson, _, _, state = lesson_of(config, state, taught=taught, seed=seed)
-        mine = np.asarray(lesson.choice.strategy)[np.asarray(taught)]
+        mine = lesson.choice.strategy[taught]
         asked += (mine == 1).sum()
         assert asked == 5 and not (mine == 2).any()
-        lesson = lessons.grade(lesson, jnp.ones(B, bool), jnp.ones(B), radius=0.5)
+        lesson = grade(lesson, np.ones(B, bool), np.ones(B, np.float32), radius=0.5)
         state, metrics = learn(config, state, lesson)
         assert int(metrics["queries_guide"]) == 5
 
 
 def test_asking_evenly_pays_no_heed_to_progress():
     config = settings(ask="evenly", teachers=[{**GUIDE, "cost": 100}, AIMS])
-    state = strategies.init(config, four_regions())
-    state = state.replace(gains=state.gains.at[:, 2].set(1.0))
-    counts = sum(
-        np.bincount(np.asarray(lesson_of(config, state, seed=seed)[0].choice.strategy), minlength=3)
-        for seed in range(5)
-    )
+    state = begun(config)
+    state = state.replace(gains=put(state.gains, (slice(None), 2), 1.0))
+    counts = sum(np.bincount(lesson_of(config, state, seed=seed)[0].choice.strategy, minlength=3) for seed in range(5))
     assert stats.chisquare(counts).pvalue > 1e-3
 
 
 def test_who_has_mastered_a_region_asks_nobody_there():
-    mastery = jnp.array([0.0, 0.25, 1.0, 0.75])
+    mastery = [0.0, 0.25, 1.0, 0.75]
     asked = {}
     for unaided in (False, True):
         config = settings(teachers=[GUIDE, AIMS], unaided=unaided)
-        state = strategies.init(config, four_regions())
-        known = state.competences.at[:4, 0].set(mastery)
-        state = state.replace(competences=known, written=state.written.at[:4].set(1))
+        state = begun(config)
+        known = put(state.competences, (slice(4), 0), mastery)
+        state = state.replace(competences=known, written=put(state.written, slice(4), 1))
         asked[unaided] = np.zeros(4)
         for seed in range(12):
             lesson, _, goal, _ = lesson_of(config, state, seed=seed)
-            region = [located(np.asarray(g)) for g in goal]
-            asked[unaided] += np.bincount(region, np.asarray(lesson.choice.strategy) > 0, minlength=4)
+            region = [located(g) for g in goal]
+            asked[unaided] += np.bincount(region, lesson.choice.strategy > 0, minlength=4)
     share = asked[True] / asked[False]
     assert share[0] == 1 and share[2] == 0
     assert abs(share[1] - 0.75) < 0.15 and abs(share[3] - 0.25) < 0.15
@@ -177,8 +196,8 @@ def test_who_has_mastered_a_region_asks_nobody_there():
 def test_ways_are_points_on_the_straight_legs_of_those_who_are_led():
     config = settings(teachers=[GUIDE, AIMS])
     lesson, start, _, _ = lesson_of(config)
-    led = np.flatnonzero(np.asarray(lesson.choice.strategy) == 1)
-    paths, weight = lessons.ways(config, lesson, start, most=len(led) + 2, parts=5)
+    led = np.flatnonzero(lesson.choice.strategy == 1)
+    paths, weight = ways(config, lesson, start, most=len(led) + 2, parts=5)
     assert paths.shape == (len(led) + 2, lesson.waypoints.shape[1] * 5, 2) and weight.tolist() == [1.0] * len(led) + [
         0.0,
         0.0,
@@ -187,8 +206,8 @@ def test_ways_are_points_on_the_straight_legs_of_those_who_are_led():
         corners = [start[b], *lesson.waypoints[b]]
         expected = [np.linspace(a, b, 5) for a, b in zip(corners, corners[1:], strict=False)]
         np.testing.assert_allclose(path, np.concatenate(expected), atol=1e-5)
-    fewer, _ = lessons.ways(config, lesson, start, most=2, parts=5)
-    np.testing.assert_array_equal(fewer, paths[:2])
+    fewer, _ = ways(config, lesson, start, most=2, parts=5)
+    np.testing.assert_array_equal(fewer, np.asarray(paths)[:2])
 
 
 def test_waypoints_are_passed_where_the_agent_is_near():
@@ -196,8 +215,8 @@ def test_waypoints_are_passed_where_the_agent_is_near():
     points, position = rng.uniform(0, 4, (B, L, 2)).astype(np.float32), rng.uniform(0, 4, (B, 2)).astype(np.float32)
     leg = rng.integers(0, L + 1, B)
     config = settings(teachers=[GUIDE], waypoint_radius=1.2)
-    lesson = lesson_of(config)[0].replace(waypoints=jnp.asarray(points), leg=jnp.asarray(leg))
-    after, coming, guided = jax.jit(lessons.impose)(config, lesson, jnp.asarray(position))
+    lesson = lesson_of(config)[0].replace(waypoints=points, leg=leg)
+    after, coming, guided = jax.device_get(impose(config, lesson, position))
     passed = 0
     for b in range(B):
         expected = leg[b]
@@ -217,8 +236,9 @@ def test_a_way_leaves_a_region_where_one_who_walks_it_first_does():
     position, points = rng.uniform(0, 4, (B, 2)).astype(np.float32), rng.uniform(0, 4, (B, L, 2)).astype(np.float32)
     leg = rng.integers(0, L + 1, B)
     lower, upper = (np.floor(position / 2) * 2 + side for side in (0, 2))
-    lesson = lesson_of(config)[0].replace(waypoints=jnp.asarray(points), leg=jnp.asarray(leg))
-    found, leaves = jax.jit(lambda *known: lessons.onward(lesson, *known, parts=5))(position, lower, upper)
+    lesson = lesson_of(config)[0].replace(waypoints=points, leg=leg)
+    onward = jax.jit(lambda *known: lessons.onward(lesson, *known, parts=5))
+    found, leaves = jax.device_get(onward(position, lower, upper))
     for b in range(B):
         corners = [position[b], *points[b, leg[b] :]]
         way = [p for a, c in zip(corners, corners[1:], strict=False) for p in np.linspace(a, c, 5, dtype=np.float32)]
@@ -230,85 +250,72 @@ def test_a_way_leaves_a_region_where_one_who_walks_it_first_does():
 
 
 def test_competence_is_how_much_nearer_the_first_episode_came():
-    lesson = lesson_of(settings(goals=True))[0].replace(away=jnp.full(B, 8.0))
-    lesson = lessons.grade(lesson, jnp.arange(B) == 0, jnp.full(B, 6.0), radius=2.0)  # from 8 m to 4 m
+    far = lambda distance: np.full(B, distance, np.float32)  # noqa: E731
+    everybody = np.ones(B, bool)
+    lesson = lesson_of(settings(goals=True))[0].replace(away=far(8.0))
+    lesson = jax.device_get(grade(lesson, np.arange(B) == 0, far(6.0), radius=2.0))  # from 8 m to 4 m
     assert float(lesson.competence[0]) == pytest.approx(0.5) and np.isinf(lesson.competence[1:]).all()
-    lesson = lessons.grade(lesson, jnp.ones(B, bool), jnp.full(B, 1.0), radius=2.0)
+    lesson = jax.device_get(grade(lesson, everybody, far(1.0), radius=2.0))
     assert float(lesson.competence[0]) == pytest.approx(0.5) and (lesson.competence[1:] == 1).all()
-    away = lesson.replace(competence=jnp.full(B, jnp.inf))
-    worse = lessons.grade(away, jnp.ones(B, bool), jnp.full(B, 30.0), radius=2.0)
+    away = lesson.replace(competence=far(np.inf))
+    worse = jax.device_get(grade(away, everybody, far(30.0), radius=2.0))
     assert (worse.competence == 0).all()
 
 
 def test_only_what_is_taught_is_learnt_from():
-    config = settings(goals=True, strategies=["autonomous", "babbling"])
-    taught = jnp.arange(B) < 10
+    config = settings(strategies=OWN)
+    taught = np.arange(B) < 10
     lesson, _, _, state = lesson_of(config, taught=taught)
-    lesson = lesson.replace(competence=jnp.where(taught, 0.5, 1.0))
-    after, metrics = learn(config, state, lesson)
+    lesson = lesson.replace(competence=np.where(taught, 0.5, 1.0).astype(np.float32))
+    after, metrics = jax.device_get(learn(config, state, lesson))
     assert float(after.episodes.sum()) == 10
     assert float(metrics["competence"]) == pytest.approx(0.5)
-    asked = np.asarray(lesson.choice.strategy)[:10]
-    assert float(metrics["share_babbling"]) == pytest.approx((asked == 1).mean())
-    assert float(metrics["share_autonomous"] + metrics["share_babbling"]) == pytest.approx(1)
-    np.testing.assert_array_equal(
-        lessons.babbles(config, lesson), np.asarray(taught) & (np.asarray(lesson.choice.strategy) == 1)
-    )
+    asked = lesson.choice.strategy[:10]
+    for number, name in enumerate(OWN):
+        assert float(metrics[f"share_{name}"]) == pytest.approx((asked == number).mean())
+    np.testing.assert_array_equal(lessons.babbles(config, lesson), taught & (lesson.choice.strategy == 1))
 
 
 def test_edges_to_what_is_half_mastered_and_stands_still_are_the_most_urgent():
     config = settings(refinement=True)
-    state = strategies.init(config, four_regions())
+    state = begun(config)
     window = state.competences.shape[1]
-    levels = jnp.array([0.0, 1.0, 0.5, 0.5, 0, 0])
-    competences = (
-        jnp.repeat(levels[:, None], window, axis=1).at[3, : window // 2].set(0.2).at[3, window // 2 :].set(0.8)
-    )
-    state = state.replace(competences=competences, written=jnp.full(6, window))
-    weight = np.asarray(lessons.urgency(config, state))
+    competences = np.repeat(np.float32([0.0, 1.0, 0.5, 0.5, 0, 0])[:, None], window, axis=1)
+    competences[3] = np.where(np.arange(window) < window // 2, 0.2, 0.8)
+    state = state.replace(competences=competences, written=np.full(6, window, np.int32))
+    weight = np.asarray(jax.jit(lessons.urgency)(config, state))
     assert weight[2] == pytest.approx(1) and weight[0] == weight[1] == pytest.approx(0.1)
     assert weight[0] < weight[3] < weight[2]
     assert lessons.urgency(settings(goals=True), state) == 1.0
 
 
+def drawn(allowed, attraction, *, where, n=4000):
+    """How often each of five regions is the random target of `n` who are `where` and have their goal there."""
+    state = CommanderState(q=np.zeros((5, 5, 5), np.float32), chosen=np.zeros(5, np.float32))
+    both, here = Successors(allowed, allowed), np.full(n, where)
+    attraction, key = np.float32(attraction), jax.random.key(0)
+    return np.bincount(choose(state, both, here, here, attraction=attraction, epsilon=1.0, key=key), minlength=5)
+
+
 def test_random_targets_follow_their_attraction():
-    size, n = 5, 4000
-    state = commander.init(loading.parse({}).commander, regions=size)
-    allowed = jnp.ones((size, size), bool).at[:, 1].set(False)
-    attraction = jnp.array([0.1, 0.4, 0.2, 0.3, 0.0])
-    zeros = jnp.zeros(n, jnp.int32)
-    targets = values.choose(
-        state,
-        Successors(allowed, allowed),
-        zeros,
-        zeros,
-        attraction=attraction,
-        epsilon=1.0,
-        key=jax.random.key(0),
-    )
-    counts = np.bincount(targets, minlength=size)
+    allowed = put(np.ones((5, 5), bool), (slice(None), 1), False)
+    counts = drawn(allowed, [0.1, 0.4, 0.2, 0.3, 0.0], where=0)
     assert counts[1] == counts[4] == 0
-    assert stats.chisquare(counts[[0, 2, 3]], n * np.array([1, 2, 3]) / 6).pvalue > 1e-3
+    assert stats.chisquare(counts[[0, 2, 3]], 4000 * np.array([1, 2, 3]) / 6).pvalue > 1e-3
 
 
 def test_targets_that_hardly_attract_are_drawn_evenly_among_themselves():
-    size, n = 4, 3000
-    state = commander.init(loading.parse({}).commander, regions=size)
-    allowed = jnp.ones((size, size), bool).at[:, 0].set(False)
-    zeros = jnp.zeros(n, jnp.int32)
-    successors, attraction = Successors(allowed, allowed), jnp.array([1.0, 1e-4, 1e-4, 1e-4])
-    targets = values.choose(
-        state, successors, zeros + 1, zeros + 1, attraction=attraction, epsilon=1.0, key=jax.random.key(0)
-    )
-    assert stats.chisquare(np.bincount(targets, minlength=size)[1:]).pvalue > 1e-3
+    allowed = put(np.ones((5, 5), bool), (slice(None), 0), False)
+    counts = drawn(allowed, [1.0, 1e-4, 1e-4, 1e-4, 1e-4], where=1)
+    assert counts[0] == 0 and stats.chisquare(counts[1:]).pvalue > 1e-3
 
 
 def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
     config = loading.parse({"commander": {"learner": "q", "learning_rate": 0.5, "reward": "mean"}}).commander
-    state = commander.init(config, regions=3)
-    state = state.replace(q=state.q.at[0, 1].set(jnp.array([0.0, 1.0, 0.4])))
-    allowed = Successors(jnp.ones((3, 3), bool), jnp.ones((3, 3), bool))
-    one = lambda value: jnp.full(1, value)  # noqa: E731
+    q = put(np.zeros((3, 3, 3), np.float32), (0, 1), [0.0, 1.0, 0.4])
+    state = CommanderState(q=q, chosen=np.zeros(3, np.float32))
+    allowed = Successors(np.ones((3, 3), bool), np.ones((3, 3), bool))
+    one = lambda value: np.full(1, value, np.int32 if isinstance(value, int) else np.float32)  # noqa: E731
     decision = Decision(
         region=one(0),
         goal_region=one(1),
@@ -319,7 +326,7 @@ def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
         lost=one(0.0),
         practised=one(0.0),
         aside=one(1.0),
-        goal=jnp.zeros((1, 2)),
+        goal=np.zeros((1, 2), np.float32),
         shown=one(1.0),
     )
     alone = state.q[0, 1, 2]  # a waypoint tells nothing of what its region is worth
@@ -328,7 +335,7 @@ def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
     observe = jax.jit(q_learning.observe)
 
     def learnt(shown, **margin):
-        return float(observe(config, state, roadmap, decision.replace(shown=shown), **margin).q[0, 1, 2])
+        return float(observe(config, state, roadmap, decision.replace(shown=shown), **margin).q.tolist()[0][1][2])
 
     assert learnt(None) == alone
     assert learnt(one(1.0), margin=0.2) == pytest.approx(float(alone) + 0.5 * (1.0 + 0.2 - float(alone)))
@@ -345,8 +352,8 @@ def test_the_actor_comes_near_to_demonstrated_actions(learner):
     parsed = loading.parse({"controller": {"learner": name, name: values}, "trainer": {"num_envs": 4}, **alone})
     config = parsed.controller.settings
     rng = np.random.default_rng(0)
-    noise = lambda *shape: jnp.asarray(rng.normal(size=(4, 8, *shape)), jnp.float32)  # noqa: E731
-    nothing, whole = jnp.zeros((4, 8)), jnp.ones((4, 8))
+    noise = lambda *shape: rng.normal(size=(4, 8, *shape)).astype(np.float32)  # noqa: E731
+    nothing, whole = np.zeros((4, 8), np.float32), np.ones((4, 8), np.float32)
     rollout = Transition(
         obs=noise(3),
         action=noise(2),
@@ -358,11 +365,13 @@ def test_the_actor_comes_near_to_demonstrated_actions(learner):
     )
     example = jax.tree.map(lambda x: x[0, 0], rollout)
     shown = Imitation(
-        obs=jnp.asarray(rng.normal(size=(16, 3)), jnp.float32), action=jnp.full((16, 2), 0.5), weight=jnp.ones(16)
+        obs=rng.normal(size=(16, 3)).astype(np.float32),
+        action=np.full((16, 2), 0.5, np.float32),
+        weight=np.ones(16, np.float32),
     )
 
     @jax.jit
-    def far(weight):
+    def far(weight, rollout, shown):
         def once(state, key):
             imitation = shown.replace(weight=weight * shown.weight)
             return learner.update(config, state, rollout, imitation=imitation, key=key)[0], None
@@ -372,17 +381,17 @@ def test_the_actor_comes_near_to_demonstrated_actions(learner):
         done = learner.act(config, state, shown.obs, deterministic=True, key=jax.random.key(0))
         return jnp.abs(done - shown.action).mean()
 
-    assert far(10.0) < 0.5 * far(0.0)
+    assert far(10.0, rollout, shown) < 0.5 * far(0.0, rollout, shown)
 
 
 def test_steps_of_demonstrations_lead_to_the_end_of_their_segment():
-    demos = demonstrations()
-    drawn = lessons.shown(demos, 3, size=200, key=jax.random.key(0))
-    states, lengths = np.asarray(demos.states), np.asarray(demos.lengths)
+    demos = shown(0, L)
+    drawn = jax.device_get(
+        jax.jit(lambda demos, key: lessons.shown(demos, 3, size=200, key=key))(demos, jax.random.key(0))
+    )
+    states, lengths = demos.states, demos.lengths
     seen = set()
-    for state, later, action, outcome in zip(
-        *map(np.asarray, (drawn.state, drawn.later, drawn.action, drawn.outcome)), strict=True
-    ):
+    for state, later, action, outcome in zip(drawn.state, drawn.later, drawn.action, drawn.outcome, strict=True):
         n, t = (int(i[0]) for i in np.nonzero((states == state).all(axis=-1)))
         assert t < lengths[n]
         np.testing.assert_array_equal(later, states[n, min(t // 3 * 3 + 3, lengths[n])])
@@ -412,30 +421,46 @@ def test_what_does_not_fit_is_refused_in_one_line(values, told):
     assert told in str(error.value) and "\n" not in str(error.value)
 
 
-def test_sgim_follows_every_cut_of_the_agents_regions(fresh):
-    before = fresh(sgim={"teachers": [GUIDE]})
-    last = int(before.abstraction.count)
-    cuts = [Cut(jnp.int32(15), jnp.int32(0), jnp.float32(9.0)), Cut(jnp.int32(last), jnp.int32(1), jnp.float32(5.0))]
-    undone = Cut(jnp.int32(3), jnp.int32(0), jnp.float32(-2.0))
-    table = before.abstraction
-    for cut in cuts:
-        table, _ = regions.split(table, cut, min_width=0.01)
-    splits = [Split(jnp.array(True), cut, jnp.int32(last + i)) for i, cut in enumerate(cuts)]
-    splits.append(Split(jnp.array(False), undone, jnp.int32(last + 1)))
-    change = Change.of(before.abstraction, table, jax.tree.map(lambda *parts: jnp.stack(parts), *splits))
-    goals = jnp.array([[5.0, 1.0], [12.0, 3.0], [12.0, 8.0]])  # below the first cut, below and above the second
-    known = before.sgim.replace(
-        goals=before.sgim.goals.at[15, :3].set(goals),
-        competences=before.sgim.competences.at[15, :3].set(jnp.array([0.1, 0.2, 0.3])),
-        written=before.sgim.written.at[15].set(3),
-        episodes=before.sgim.episodes.at[15].set(8.0),
+def test_sgim_follows_every_cut_of_the_agents_regions():
+    config = settings(teachers=[GUIDE])
+    table = regions.create(((-4.0, -4.0), (20.0, 20.0)), ((4.0,), (10.0,)), max_regions=7)
+    known, last = jax.device_get(strategies.init(config, table)), 4  # region 2 is [4, 20) x [-4, 10)
+    cuts = [Cut(np.int32(2), np.int32(0), np.float32(9.0)), Cut(np.int32(last), np.int32(1), np.float32(5.0))]
+    undone = Cut(np.int32(3), np.int32(0), np.float32(-2.0))
+    splits = [Split(np.array(True), cut, np.int32(last + i)) for i, cut in enumerate(cuts)]
+    splits.append(Split(np.array(False), undone, np.int32(last + 1)))
+    goals = [[5.0, 1.0], [12.0, 3.0], [12.0, 8.0]]  # below the first cut, below and above the second
+    known = known.replace(
+        goals=put(known.goals, (2, slice(3)), goals),
+        competences=put(known.competences, (2, slice(3)), [0.1, 0.2, 0.3]),
+        written=put(known.written, 2, 3),
+        episodes=put(known.episodes, 2, 8.0),
     )
-    after = lessons.follow(known, change)
+
+    @jax.jit
+    def followed(known, splits):
+        table = known.abstraction
+        for cut in cuts:
+            table, _ = regions.split(table, cut, min_width=0.01)
+        after = lessons.follow(known, Change.of(known.abstraction, table, splits))
+        return after, table, selection.competence(after)
+
+    after, table, competence = jax.device_get(followed(known, jax.tree.map(lambda *parts: np.stack(parts), *splits)))
     jax.tree.map(np.testing.assert_array_equal, after.abstraction, table)
-    parts = jnp.array([15, last, last + 1])
+    assert table.count == 6
+    parts = [2, last, last + 1]
     assert after.written[parts].tolist() == [1, 1, 1]
     assert after.episodes[parts, 0].tolist() == [4, 2, 2]  # halved at each cut
-    np.testing.assert_allclose(selection.competence(after)[parts], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(competence[parts], [0.1, 0.2, 0.3])
+
+
+def lived(obs, box, choice, *, terminated=0.0):
+    """A segment of L steps in which nobody moves."""
+    steps = jnp.zeros((L, len(obs)))
+    return Segment(
+        obs=jnp.stack([obs] * (L + 1)), seen=(), subgoal=(), action=steps, terminated=steps + terminated, ended=steps,
+        success=steps, distance=steps, alive=steps + 1, non_finite=steps, overflow=steps, box=box, choice=choice,
+    )  # fmt: skip
 
 
 def commanded_in(playing, state, streams, lesson, *, key):
@@ -465,28 +490,29 @@ def test_a_teacher_leads_by_the_regions_that_the_commander_will_have_to_choose(t
     )
     n = breaking_env.num_envs
     lesson = jax.tree.map(lambda x: x[:n], lesson_of(agent.sgim)[0])
-    led = np.asarray(lessons.guided(agent.sgim, lesson))
-    playing, state = levels.of(agent, spec), fresh(sgim={"teachers": [GUIDE]})
+    led = lessons.guided(agent.sgim, lesson)
+    playing, state = levels.of(agent, spec), fresh()
 
     @jax.jit
     def commanded(state, key, waypoints):
         streams = play.start(playing, breaking_env, greedy=True, key=key)
         memory, *_ = commanded_in(playing, state, streams, lesson.replace(waypoints=waypoints), key=key)
-        return state.abstraction, spec.goal_point(streams.env.obs), memory
+        return spec.goal_point(streams.env.obs), memory
 
-    _, goal, _ = commanded(state, jax.random.key(0), lesson.waypoints)
-    beside = jnp.asarray([[-0.1, 0.1], [0.3, 0.1]])[None] * jnp.ones((n, 1, 1))  # two regions on, then to the goal
-    table, _, after = commanded(state, jax.random.key(0), jnp.concatenate([beside, goal[:, None]], axis=1))
-    locate = lambda p: int(regions.locate(table, jnp.asarray(p, jnp.float32)))  # noqa: E731
+    table, key = jax.device_get(state.abstraction), jax.random.key(0)
+    locate = jax.jit(jax.vmap(regions.locate, in_axes=(None, 0)))
+    goal, _ = jax.device_get(commanded(state, key, np.zeros((n, 3, 2), np.float32)))
+    beside = np.tile(np.float32([[-0.1, 0.1], [0.3, 0.1]]), (n, 1, 1))  # two regions on, then to the goal
+    _, after = jax.device_get(commanded(state, key, np.concatenate([beside, goal[:, None]], axis=1)))
     for b in np.flatnonzero(led):
         corners = [after.start[b], *beside[b], goal[b]]
         way = [p for a, c in zip(corners, corners[1:], strict=False) for p in np.linspace(a, c, 16)]
-        onward = next(j for j in map(locate, way) if j != int(after.region[b]))
+        onward = next(j for j in locate(table, np.float32(way)).tolist() if j != int(after.region[b]))
         assert int(after.target[b]) == onward != int(after.goal_region[b])
         np.testing.assert_array_equal(after.box.lower[b], table.lower[onward])
         np.testing.assert_array_equal(after.box.upper[b], table.upper[onward])
-    *_, direct = commanded(state, jax.random.key(0), jnp.repeat(goal[:, None], 3, axis=1) + 0.5)
-    arriving = led & (np.asarray(direct.target) == np.asarray(direct.goal_region))
+    _, direct = jax.device_get(commanded(state, key, np.repeat(goal[:, None], 3, axis=1) + np.float32(0.5)))
+    arriving = led & (direct.target == direct.goal_region)
     assert arriving.any()
     np.testing.assert_allclose(direct.box.centre[arriving], goal[arriving], atol=1e-4)  # as without a teacher
 
@@ -499,38 +525,37 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
     lesson, _, _, _ = lesson_of(agent.sgim)
     n = breaking_env.num_envs
     lesson = jax.tree.map(lambda x: x[:n], lesson)
-    led = np.asarray(lessons.guided(agent.sgim, lesson))
+    led = lessons.guided(agent.sgim, lesson)
     assert led.any() and not led.all()
     playing = levels.of(agent, turning)
 
-    def chosen(key, lesson):
-        state = levels.init(agent, turning, key=key)
-        streams = play.start(playing, breaking_env, key=key)
-        obs, marks = streams.env.obs, Marks()
-        if lesson is not None:
-            nowhere, position = jnp.zeros(n, bool), turning.abstract(obs)
-            _, marks = lessons.mark(agent.sgim, lesson, state.abstraction, position, due=nowhere)
-        box = streams.memory.box
-        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, box, marks, explore=True, key=key)
-        _, passed = play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)
-        learnt = tutor.experience(agent.tutor, playing.task, passed, marks, renewed=jnp.zeros(n, bool))
-        return obs, choice.subgoal, learnt
+    @jax.jit
+    def chosen(key, lesson, table):
+        state, streams = tutor.init(key, agent.tutor, playing.task), play.start(playing, breaking_env, key=key)
+        obs, box = streams.env.obs, streams.memory.box
+        _, marks = lessons.mark(agent.sgim, lesson, table, turning.abstract(obs), due=jnp.zeros(n, bool))
+        act = lambda marks: tutor.act(  # noqa: E731
+            agent.tutor, playing.task, state, obs, box, marks, explore=True, key=key
+        )
+        choice = act(marks)
+        renewed, passed = jnp.zeros(n, bool), lived(obs, box, choice)
+        learnt = tutor.experience(agent.tutor, playing.task, passed, marks, renewed=renewed)
+        return turning.pose(obs), choice.subgoal, act(Marks()).subgoal, learnt
 
-    obs, subgoal, decisions = jax.jit(chosen)(jax.random.key(0), lesson)
-    alone = jax.jit(chosen)(jax.random.key(0), None)[1]
+    pose, subgoal, alone, decisions = jax.device_get(chosen(jax.random.key(0), lesson, four_regions()))
     np.testing.assert_array_equal(subgoal[~led], alone[~led])
-    pose, scale = np.asarray(turning.pose(obs)), np.asarray(turning.scale)
+    scale = np.asarray(turning.scale)
     for b in np.flatnonzero(led):
-        way = np.asarray(lesson.waypoints[b, 0]) - pose[b, :2]
+        way = lesson.waypoints[b, 0] - pose[b, :2]
         straight = np.concatenate([way, turning.heading * way / np.linalg.norm(way) - pose[b, 2:]])
         np.testing.assert_allclose(subgoal[b], np.clip(straight, -scale, scale), atol=1e-4)
 
     np.testing.assert_array_equal(decisions.weight, ~led)  # what is shown is no experience of the Tutor's own
-    stacked = jax.tree.map(lambda x: jnp.stack([x, x]), decisions)
+    stacked = jax.tree.map(lambda x: np.stack([x, x]), decisions)
     taken = []
     monkeypatch.setattr(tutor.learners, "update", lambda *_, imitation, **__: taken.append(imitation) or (None, {}))
-    for shown in (jnp.stack([led, led & False]), None):
-        imitate = lessons.imitating(agent.sgim, shown)
+    for given in (jnp.stack([led, led & False]), None):
+        imitate = lessons.imitating(agent.sgim, given)
         tutor.learn(
             agent.tutor, playing.task, None, stacked, below=None, penalty=None, imitate=imitate, key=jax.random.key(0)
         )
@@ -542,13 +567,11 @@ def test_on_the_way_to_a_teachers_waypoint_subgoals_are_straight_ahead_and_the_t
 
 
 def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, fresh):
-    agent, state = loading.parse(tiny).hyper(), fresh(sgim={"teachers": [GUIDE]})
-    i, j = map(
-        int,
-        np.argwhere(np.asarray(regions.adjacent(state.abstraction)) & ~np.eye(len(state.graph.told), dtype=bool))[0],
-    )
-    nothing = jnp.zeros(3, jnp.int32)
-    decision = Decision(*[nothing] * 3, *[jnp.zeros(3)] * 1, nothing, *[jnp.zeros(3)] * 5)
+    agent, state = loading.parse(tiny).hyper(), fresh()
+    adjacent = np.asarray(jax.jit(regions.adjacent)(state.abstraction))
+    i, j = map(int, np.argwhere(adjacent & ~np.eye(len(adjacent), dtype=bool))[0])
+    where, numbers = np.zeros(3, np.int32), np.zeros(3, np.float32)
+    decision = Decision(*[where] * 3, numbers, where, *[numbers] * 5)
 
     @jax.jit
     def value(told):
@@ -560,29 +583,22 @@ def test_what_teachers_only_go_around_to_is_not_believed_to_be_reached(tiny, fre
     assert float(value(-1)) < float(value(0)) == float(value(1))
 
 
-def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, breaking_env):
-    own = {"strategies": ["autonomous", "babbling", "decomposition"], "waypoint_radius": 0.01}
-    agent, spec = loading.parse({**tiny, "sgim": own}).hyper(), Spec.of(breaking_env.env)
+def test_what_babblers_and_those_on_a_detour_do_tells_nothing_of_commands(tiny, breaking_env, fresh):
+    agent = loading.parse({**tiny, "sgim": {"strategies": OWN, "waypoint_radius": 0.01}}).hyper()
     lesson = jax.tree.map(lambda x: x[: breaking_env.num_envs], lesson_of(agent.sgim)[0])
-    babbling, detour = (np.asarray(lesson.choice.strategy) == number for number in (1, 2))
+    babbling, detour = (lesson.choice.strategy == number for number in (1, 2))
     assert babbling.any() and detour.any() and not (babbling | detour).all()
-    playing = levels.of(agent, spec)
+    playing, section = levels.of(agent, Spec.of(breaking_env.env)), agent.commander
 
     @jax.jit
-    def finished(key, terminated):
-        state = levels.init(agent, spec, key=key)
+    def finished(state, key, terminated):
         streams = play.start(playing, breaking_env, greedy=True, key=key)
         memory, marks, roadmap = commanded_in(playing, state, streams, lesson, key=key)
-        obs, section = streams.env.obs, agent.commander
-        choice = tutor.act(agent.tutor, playing.task, state.tutor, obs, memory.box, marks, explore=True, key=key)
-        streams = streams.replace(memory=memory)
-        _, passed = play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)
-        ones = jnp.ones_like(passed.alive)
-        passed = passed.replace(alive=ones, ended=0 * ones, terminated=terminated * ones)
+        passed = lived(streams.env.obs, memory.box, None, terminated=terminated)
         last = memory.replace(clock=memory.clock + section.period - agent.tutor.period)
         return commander.experience(section, playing.task, roadmap, last, passed, marks)[1]
 
-    decision, outcome = finished(jax.random.key(0), 0.0)
+    decision, outcome = jax.device_get(finished(fresh(), jax.random.key(0), 0.0))
     np.testing.assert_array_equal(decision.aside, detour)
-    for told in (decision.weight, finished(jax.random.key(0), 1.0).decision.lost, outcome.weight):
+    for told in (decision.weight, finished(fresh(), jax.random.key(0), 1.0).decision.lost, outcome.weight):
         np.testing.assert_array_equal(np.asarray(told) > 0, ~babbling)

@@ -49,7 +49,13 @@ def shown(n=3, *, actions=True, seed=0):
 
 
 def demonstrations(*args, **kwargs):
-    return Demonstrations(**{name: jnp.asarray(array) for name, array in shown(*args, **kwargs).items()})
+    return Demonstrations(**shown(*args, **kwargs))
+
+
+# Compiled once, not each time that a test calls them.
+nearest = jax.jit(teachers.nearest)
+repetitive, wrong_half = jax.jit(teachers.repetitive), jax.jit(teachers.wrong_half)
+other_body = jax.jit(teachers.other_body)
 
 
 def a_file(tmp_path, **changes):
@@ -71,7 +77,7 @@ def task(name):
 def test_the_nearest_demonstration_is_the_one_that_looking_at_each_finds(n, seed, by_start):
     demos = demonstrations(n, actions=False, seed=seed)
     start, goal = np.random.default_rng(seed + 100).uniform(-4, 20, (2, 5, 2)).astype(np.float32)
-    asked = np.asarray(teachers.nearest(demos, start if by_start else None, goal))
+    asked = np.asarray(nearest(demos, start if by_start else None, goal))
     for i in range(5):
         apart = [
             np.sum((goal[i] - outcome) ** 2) + by_start * np.sum((start[i] - begin) ** 2)
@@ -83,10 +89,10 @@ def test_the_nearest_demonstration_is_the_one_that_looking_at_each_finds(n, seed
 def test_the_nearest_is_found_for_one_learner_for_many_and_in_a_compiled_program():
     demos = demonstrations(5, actions=False)
     starts, goals = demos.starts[::-1], demos.outcomes[::-1]
-    many = jax.jit(teachers.nearest)(demos, starts, goals)
+    many = nearest(demos, starts, goals)
     one_by_one = jax.vmap(lambda start, goal: teachers.nearest(demos, start, goal))(starts, goals)
     assert many.tolist() == one_by_one.tolist() == [4, 3, 2, 1, 0]
-    assert teachers.nearest(demos, None, goals[1]).tolist() == 3
+    assert nearest(demos, None, goals[1]).tolist() == 3
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -107,16 +113,16 @@ def test_the_map_of_every_task_can_be_shown(name):
 def test_the_ant_is_shown_how_to_stand_beyond_the_gap():
     env = envs.make("ant_fall", engine="native")
     demos = teachers.shortest_paths(env)
-    asked = teachers.nearest(demos, jnp.array([0.0, 0.0, 4.5]), jnp.array([0.0, 27.0, 4.5]))
+    asked = nearest(demos, np.float32([0.0, 0.0, 4.5]), np.float32([0.0, 27.0, 4.5]))
     np.testing.assert_array_equal(
-        demos.waypoints[asked], [[8.0, 0.0, 4.5], [8.0, 24.0, 4.5], [0.0, 24.0, 4.5], [0.0, 24.0, 4.5]]
+        np.asarray(demos.waypoints)[asked], [[8.0, 0.0, 4.5], [8.0, 24.0, 4.5], [0.0, 24.0, 4.5], [0.0, 24.0, 4.5]]
     )
 
 
 def test_the_environment_says_where_the_gate_opens():
     demos = teachers.shortest_paths(envs.make("point_maze_cam", cell=4.0))
-    asked = teachers.nearest(demos, jnp.zeros(2), jnp.array([0.0, 8.0]))
-    np.testing.assert_array_equal(demos.waypoints[asked], [[9.0, 0.0], [8.0, 8.0], [0.0, 8.0]])
+    asked = nearest(demos, np.zeros(2, np.float32), np.float32([0.0, 8.0]))
+    np.testing.assert_array_equal(np.asarray(demos.waypoints)[asked], [[9.0, 0.0], [8.0, 8.0], [0.0, 8.0]])
 
 
 def test_of_a_large_map_some_cells_spread_over_it_are_shown_and_the_start_is_among_them():
@@ -132,16 +138,16 @@ def test_of_a_large_map_some_cells_spread_over_it_are_shown_and_the_start_is_amo
 
 def test_a_repetitive_teacher_always_shows_the_same():
     demos = demonstrations(5)
-    poor = teachers.repetitive(demos)
+    poor = repetitive(demos)
     far = int(np.argmax(np.linalg.norm(np.asarray(demos.outcomes - demos.starts), axis=-1)))
-    assert set(np.asarray(teachers.nearest(poor, demos.starts, demos.outcomes)).tolist()) == {0}
-    np.testing.assert_array_equal(poor.actions[0], demos.actions[far])
+    assert set(nearest(poor, demos.starts, demos.outcomes).tolist()) == {0}
+    np.testing.assert_array_equal(np.asarray(poor.actions)[0], demos.actions[far])
     assert len(poor.lengths) == 1
 
 
 def test_a_teacher_of_the_wrong_half_knows_nothing_near_the_goal():
-    demos, goal = demonstrations(5), jnp.array([0.0, 16.0])
-    poor = teachers.wrong_half(demos, goal)
+    demos, goal = demonstrations(5), np.float32([0.0, 16.0])
+    poor = jax.device_get(wrong_half(demos, goal))
     away = sorted(np.linalg.norm(np.asarray(demos.outcomes) - [0, 16], axis=-1).tolist())
     kept = sorted(np.linalg.norm(np.asarray(poor.outcomes) - [0, 16], axis=-1).tolist())
     assert kept == pytest.approx(away[2:])
@@ -152,19 +158,19 @@ def test_a_teacher_of_the_wrong_half_knows_nothing_near_the_goal():
 
 def test_a_teacher_of_another_body_promises_the_same_and_shows_something_else():
     demos = demonstrations(5)
-    poor = teachers.other_body(demos)
+    poor = jax.device_get(other_body(demos))
     np.testing.assert_array_equal(poor.outcomes, demos.outcomes)
     np.testing.assert_array_equal(poor.waypoints[:, -1], demos.outcomes)
     np.testing.assert_array_equal(poor.actions, np.asarray(demos.actions)[..., ::-1])
-    back = teachers.other_body(poor)
+    back = other_body(poor)
     np.testing.assert_allclose(back.waypoints, demos.waypoints, atol=1e-5)
 
 
 def test_the_mirrored_route_of_the_maze_runs_into_its_wall():
     demos = teachers.shortest_paths(task("point_maze"))
-    poor = teachers.other_body(demos)
-    asked = teachers.nearest(poor, jnp.zeros(2), jnp.array([0.0, 16.0]))
-    np.testing.assert_array_equal(poor.waypoints[asked], [[0.0, 0.0], [0.0, 16.0], [0.0, 16.0]])
+    poor = other_body(demos)
+    asked = nearest(poor, np.zeros(2, np.float32), np.float32([0.0, 16.0]))
+    np.testing.assert_array_equal(np.asarray(poor.waypoints)[asked], [[0.0, 0.0], [0.0, 16.0], [0.0, 16.0]])
     assert poor.actions is None
 
 
