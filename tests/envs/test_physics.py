@@ -8,6 +8,7 @@ import pytest
 
 import envs
 from envs.tasks import TASKS
+from tests.made import made
 
 STARTS = 20
 
@@ -18,11 +19,11 @@ def body():
 
 
 def ant_body(engine, task="ant_maze"):
-    return envs.make(task, engine=engine).body
+    return made(task, engine=engine).body
 
 
 def simulations(physics, qpos, qvel):
-    return jax.vmap(physics.init)(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32))
+    return jax.jit(jax.vmap(physics.init))(np.float32(qpos), np.float32(qvel))
 
 
 def random_starts(model, n=STARTS, seed=0, floor=0.0):
@@ -63,7 +64,7 @@ def test_mjx_engine_agrees_with_native(body):
     qpos, qvel, ctrl = random_starts(body.physics.model, 4)
     qpos[:, 2], qpos[:, 3:] = 0.15, body.physics.model.qpos0[3:] + 0.1 * (qpos[:, 3:] - body.physics.model.qpos0[3:])
     data = simulations(body.physics, qpos, 0.1 * qvel)
-    native = jax.vmap(body.physics.step)(data, ctrl)
+    native = jax.jit(jax.vmap(body.physics.step))(data, ctrl)
     plain = mujoco.MjData(body.physics.model)
     plain.qpos = data.qpos[0]
     mujoco.mj_forward(body.physics.model, plain)
