@@ -201,7 +201,9 @@ def test_env_steps_are_those_that_ogbench_itself_made_and_margins_matter():
     for margin, noticed in (({"margin": 0.01}, ~wall), ({"wall_margin": 0.0}, wall)):
         body = envs.make("antmaze-giant", engine="native", preset="published", **margin).body
         starts = (np.float32(states[name]) for name in ("qpos", "qvel"))
-        steps = jax.jit(jax.vmap(lambda qpos, qvel, action, body=body: body.step(body.physics.init(qpos, qvel), action)))
+        steps = jax.jit(
+            jax.vmap(lambda qpos, qvel, action, body=body: body.step(body.physics.init(qpos, qvel), action))
+        )
         after = steps(*starts, np.asarray(states["action"][:, script.LEGS])).qpos
         assert (np.abs(np.asarray(after) - states["after"]).max(axis=1)[noticed] > 1e-3).mean() > 0.2
 

@@ -136,7 +136,9 @@ def test_regions_are_cut_within_a_task_and_never_along_tasks_or_what_a_task_has_
         task = number % TASKS
         goal = np.where(np.asarray(DIMENSIONS)[task], rng.uniform(size=4), 0.0).astype(np.float32)
         learnt = 0.2 * (1 - number / 250) if goal[0] > 0.5 else 0.2
-        seen = Progress(np.float32(0.2), np.float32(learnt), np.ones((1, TASKS), np.float32), np.zeros((1, TASKS), bool))
+        seen = Progress(
+            np.float32(0.2), np.float32(learnt), np.ones((1, TASKS), np.float32), np.zeros((1, TASKS), bool)
+        )
         tables = told(CONFIG, tables, Choice(np.int32(task), np.int32(0), goal), seen)
         tables = split(CONFIG, tables) if number > 200 else tables
     where = jax.device_get(tables.goals.abstraction)

@@ -69,7 +69,9 @@ def test_goals_are_reached_by_their_parts_one_after_the_other():
         goals = WORLD.benchmark(task)
         parts = jax.device_get(WORLD.decompose(task, goals))
         assert parts.exists.all() and (parts.tasks == np.array(tasks)).all()
-        (first, n), (second, m) = (jax.device_get(WORLD.demonstrate(one, parts.goals[:, i])) for i, one in enumerate(tasks))
+        (first, n), (second, m) = (
+            jax.device_get(WORLD.demonstrate(one, parts.goals[:, i])) for i, one in enumerate(tasks)
+        )
         joined = np.zeros_like(first)
         joined[:, : n[0]], joined[:, n[0] : n[0] + m[0]] = first[:, : n[0]], second[:, : m[0]]
         found = traced(joined, n + m).outcomes
