@@ -208,7 +208,7 @@ def load(run_dir: Path, *, checkpoint: str = "last", seed: int | None = None) ->
     program = programs.build(load_to_act(run_dir, {}))
     number = saved.agent_number(program.seeds, run_dir, seed)
     env_steps, states = saved.load_state(program, run_dir, checkpoint)
-    state = jax.tree.map(lambda leaf: leaf[number], states)
+    state = saved.of_one(states, number)
     return TrainedAgent(program, state, run_dir=run_dir, env_steps=env_steps, seed=program.seeds[number])
 
 

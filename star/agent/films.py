@@ -31,7 +31,7 @@ from star.agent.play import greedy
 from star.agent.sections import Config
 from star.config.section import ConfigError
 from star.training import program as programs
-from star.training.checkpoint import agent_number, load_state
+from star.training.checkpoint import agent_number, load_state, of_one
 from star.training.console import Elapsed
 
 MAX_ENVS = 25
@@ -199,9 +199,8 @@ def record_run(
 
     played = jax.device_get(jax.jit(play_all)(program.config.hyper(), states, keys))
     moments = jax.tree.map(lambda leaf: leaf[: length + 1], _joined(*played))
-    state = jax.tree.map(lambda leaf: leaf[index], states)
-    count = int(state.abstraction.count)
-    regions = np.asarray(state.abstraction.lower[:count]), np.asarray(state.abstraction.upper[:count])
+    abstraction = jax.device_get(of_one(states.abstraction, index))
+    regions = abstraction.lower[: abstraction.count], abstraction.upper[: abstraction.count]
     return Recording(env, moments, regions if config.commander.enabled else None)
 
 

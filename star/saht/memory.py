@@ -92,7 +92,7 @@ def empty(world: World, rows: int) -> Memory:
     return Memory(
         sequences=jnp.zeros((n, world.longest, world.primitive)),
         lengths=jnp.ones(n, jnp.int32),
-        outcomes=jnp.full((tasks, 4, n), FAR),
+        outcomes=jnp.full((tasks, 4, n), FAR, jnp.float32),
         pair=jnp.full(n, -1, jnp.int32),
         subgoals=jnp.zeros((n, 2, 4)),
         reached=jnp.zeros(tasks, jnp.int32),

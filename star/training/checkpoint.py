@@ -342,7 +342,13 @@ def load_agent(
     number = agent_number(program.seeds, run_dir, agent)
     _, states = load_state(program, run_dir, checkpoint)
     key = program.evaluation_keys(seed, stream=programs.AFTERWARDS)[number]
-    return program, jax.tree.map(lambda leaf: leaf[number], states), key
+    return program, of_one(states, number), key
+
+
+@jax.jit
+def of_one(states: Any, number: int) -> Any:
+    """The state of the agent of that number; in one program, since to index leaf by leaf compiles one for each."""
+    return jax.tree.map(lambda leaf: leaf[number], states)
 
 
 def agent_number(seeds: Sequence[int], run_dir: Path, agent: int | None) -> int:

@@ -106,7 +106,7 @@ def test_facts_of_the_rows(name, facts):
 
 def at(env, state, *, goal):
     """`state` with a goal that far along x from where the body is."""
-    return env.with_goal(state, state.obs[:2] + jnp.array([goal, 0.0]))
+    return jitted(env.with_goal)(state, np.asarray(state.obs[:2]) + np.array([goal, 0.0], np.float32))
 
 
 @pytest.mark.parametrize(
@@ -164,19 +164,20 @@ def test_a_thousand_points_thrown_about_neither_pass_a_wall_nor_leave(name):
     keys = jax.random.split(jax.random.key(0), 1000)
     radius, cell = TASKS[name].motion.radius, env.arena.cell
 
-    def run(state):
+    @jax.jit
+    def run(keys):
+        state = jax.vmap(env.reset)(keys)
+        data = state.pipeline_state.data
+        thrown = data.replace(velocity=data.velocity + 12 * jax.random.normal(jax.random.key(2), (1000, 2)))
+
         def step(state, key):
             state = jax.vmap(env.step)(state, jax.random.uniform(key, (1000, 2), minval=-1) > 0)
             return state, state.obs[:, :2]
 
+        state = state.replace(pipeline_state=state.pipeline_state.replace(data=thrown))
         return jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 60))[1]
 
-    state = jax.vmap(env.reset)(keys)
-    data = state.pipeline_state.data
-    thrown = data.replace(velocity=data.velocity + 12 * jax.random.normal(jax.random.key(2), (1000, 2)))
-    x, y = np.moveaxis(
-        np.asarray(jax.jit(run)(state.replace(pipeline_state=state.pipeline_state.replace(data=thrown)))), -1, 0
-    )
+    x, y = np.moveaxis(np.asarray(run(keys)), -1, 0)
     assert np.ptp(x) > 2 * cell
     x_lo, y_lo, x_hi, y_hi = env.arena.bounds
     assert ((x > x_lo) & (x < x_hi) & (y > y_lo) & (y < y_hi)).all()
@@ -199,8 +200,11 @@ def test_env_steps_are_those_that_ogbench_itself_made_and_margins_matter():
     assert (ours["terminated"] == states["terminated"]).all()
     for margin, noticed in (({"margin": 0.01}, ~wall), ({"wall_margin": 0.0}, wall)):
         body = envs.make("antmaze-giant", engine="native", preset="published", **margin).body
-        data = jax.vmap(body.physics.init)(jnp.float32(states["qpos"]), jnp.float32(states["qvel"]))
-        after = jax.vmap(body.step)(data, jnp.asarray(states["action"][:, script.LEGS])).qpos
+        starts = (np.float32(states[name]) for name in ("qpos", "qvel"))
+        steps = jax.jit(
+            jax.vmap(lambda qpos, qvel, action, body=body: body.step(body.physics.init(qpos, qvel), action))
+        )
+        after = steps(*starts, np.asarray(states["action"][:, script.LEGS])).qpos
         assert (np.abs(np.asarray(after) - states["after"]).max(axis=1)[noticed] > 1e-3).mean() > 0.2
 
 

@@ -8,9 +8,9 @@ import jax
 import numpy as np
 import pytest
 
-import envs
 from envs import EnvError, render
 from envs.render import Marks, Painter, Stage
+from tests.made import jitted, made
 
 ROOT = Path(__file__).parents[2]
 SIZE = {"width": 120, "height": 90}
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("can_draw")
 
 @pytest.fixture(scope="module")
 def point():
-    return envs.make("point_maze", goals="test")
+    return made("point_maze", goals="test")
 
 
 @pytest.fixture(scope="module")
@@ -44,14 +44,14 @@ def middle_of(pixels):
 
 @pytest.mark.parametrize("camera", render.CAMERAS)
 def test_a_frame_has_the_size_that_was_asked_for_and_shows_something(point, camera):
-    data = point.reset(jax.random.key(0)).pipeline_state.data
+    data = jitted(point.reset)(jax.random.key(0)).pipeline_state.data
     picture = render.frame(point, data, **SIZE, camera=camera)
     assert picture.shape == (90, 120, 3) and picture.dtype == np.uint8
     assert picture.std(axis=(0, 1)).min() > 10
 
 
 def test_a_frame_depends_on_the_data_and_on_nothing_else(point):
-    one, other = (point.reset(jax.random.key(seed)).pipeline_state.data for seed in (0, 1))
+    one, other = (jitted(point.reset)(jax.random.key(seed)).pipeline_state.data for seed in (0, 1))
     first, second, again = (render.frame(point, data, **SIZE) for data in (one, other, one))
     assert (first == again).all() and (first != second).any()
 
@@ -95,8 +95,8 @@ def test_a_wall_between_camera_and_body_does_not_hide_it(painter):
 
 @pytest.mark.parametrize("name", ["ant_push", "ant_fall"])
 def test_the_block_is_where_the_data_say(name):
-    env = envs.make(name, engine="native")
-    qpos, mocap_pos = map(np.array, env.pose(env.reset(jax.random.key(0)).pipeline_state.data))
+    env = made(name)
+    qpos, mocap_pos = map(np.array, env.pose(jitted(env.reset)(jax.random.key(0)).pipeline_state.data))
     stage = Stage(env)
     stage.place(qpos, mocap_pos)
     ((low, high, height),) = stage.boxes("block")
@@ -110,8 +110,8 @@ def test_the_block_is_where_the_data_say(name):
 
 
 def test_a_gate_is_where_the_data_say():
-    env = envs.make("point_maze_cam")
-    data = env.reset(jax.random.key(0)).pipeline_state.data
+    env = made("point_maze_cam")
+    data = jitted(env.reset)(jax.random.key(0)).pipeline_state.data
     stage = Stage(env)
     heights = []
     for is_open in (0.0, 1.0):
@@ -124,9 +124,9 @@ def test_a_gate_is_where_the_data_say():
 @pytest.mark.parametrize("name", ["point_3rooms", "ant_fall", "point_hardest_maze"])
 @pytest.mark.parametrize("camera", ["overview", "top"])
 def test_the_whole_arena_is_in_the_picture_and_fills_it(name, camera):
-    env = envs.make(name)
+    env = made(name)
     stage = Stage(env)
-    stage.place(*map(np.asarray, env.pose(env.reset(jax.random.key(0)).pipeline_state.data)))
+    stage.place(*map(np.asarray, env.pose(jitted(env.reset)(jax.random.key(0)).pipeline_state.data)))
     with Painter(stage, width=160, height=100) as painter:
         blank = (painter.paint(camera=camera) > 250).all(axis=-1)
     rows, columns = np.nonzero(~blank)
@@ -136,7 +136,7 @@ def test_the_whole_arena_is_in_the_picture_and_fills_it(name, camera):
 
 
 def test_an_unknown_camera_is_refused(point):
-    data = point.reset(jax.random.key(0)).pipeline_state.data
+    data = jitted(point.reset)(jax.random.key(0)).pipeline_state.data
     with pytest.raises(EnvError, match='camera "folow" is unknown.*did you mean "follow"'):
         render.frame(point, data, **SIZE, camera="folow")
 

@@ -1,6 +1,7 @@
 """Every row of the registry: goals, starts, options."""
 
 import itertools
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,8 +19,15 @@ DRAWS = 10_000
 ANT_TASKS = [name for name in envs.names() if name.startswith("ant_")]
 
 
-def draws(places, seed=0):
-    return np.asarray(jax.vmap(lambda key: maze.sample(places, key))(jax.random.split(jax.random.key(seed), DRAWS)))
+@partial(jax.jit, static_argnums=0)
+def draws_of(sets, key):
+    """`DRAWS` points of each of `sets`."""
+    keys = jax.random.split(key, DRAWS)
+    return [jax.vmap(partial(maze.sample, places))(keys) for places in sets]
+
+
+def draws(*sets):
+    return map(np.asarray, draws_of(sets, jax.random.key(0)))
 
 
 def slow_shares(places):
@@ -39,8 +47,7 @@ def test_goals_and_starts_follow_the_stated_distributions():
     tasks = [task for task in TASKS.values() if not task.pairs]
     sets = {places for task in tasks for places in (*task.goals.values(), *task.starts.values())}
     assert len(sets) > 30
-    for places in sets:
-        drawn = draws(places)
+    for places, drawn in zip(sets, draws(*sets), strict=True):
         lower, upper = np.array(places.lower), np.array(places.upper)
         inside = ((drawn[:, None] >= lower - 1e-4) & (drawn[:, None] <= upper + 1e-4)).all(axis=2)
         assert (inside.sum(axis=1) == 1).all(), "outside, or boxes overlap"
@@ -56,7 +63,8 @@ def test_goals_and_starts_follow_the_stated_distributions():
 
 def test_boxes_are_chosen_by_volume():
     places = Places(lower=((0.0, 0.0), (10.0, 0.0)), upper=((1.0, 1.0), (13.0, 1.0)))
-    assert (draws(places)[:, 0] > 5).mean() == pytest.approx(0.75, abs=0.02)
+    (drawn,) = draws(places)
+    assert (drawn[:, 0] > 5).mean() == pytest.approx(0.75, abs=0.02)
 
 
 @pytest.mark.parametrize("name", ["ant_fall", "ant_maze_sparse", "point_maze_cam", "point_big_maze"])
@@ -112,7 +120,7 @@ def test_jaxgcrl_mazes_keep_their_first_index_as_x():
 
 def test_in_the_open_goals_lie_around_the_start_and_walls_far_off():
     task = TASKS["ant_open"]
-    train, start = draws(task.goals["train"]), draws(task.starts["task"])
+    train, start = draws(task.goals["train"], task.starts["task"])
     np.testing.assert_allclose(np.linalg.norm(train, axis=1), 10.0, rtol=1e-5)
     angles = np.sort(np.arctan2(*train.T))
     assert np.diff(angles).max() * 10.0 < 0.5, "goals leave no gap as wide as success"

@@ -24,7 +24,7 @@ def env():
 
 
 def act(env, seed=0):
-    return jax.random.uniform(jax.random.key(seed), (B, env.action_size), minval=-1, maxval=1)
+    return np.random.default_rng(seed).uniform(-1, 1, (B, env.action_size)).astype(np.float32)
 
 
 def begin(vector):
@@ -53,13 +53,14 @@ def rollout(vector, state, actions):
 def test_finished_environments_begin_new_episodes_with_new_goals(env):
     vector = batch()
     state, step = begin(vector), jitted(vector.step)
-    goals = [state.obs[:, env.state_dim :]]
+    goals = [np.asarray(state.obs)[:, env.state_dim :]]
     for _ in range(4):
         for _ in range(env.episode_length):
             state = step(state, act(env))
         np.testing.assert_array_equal(state.info["steps"], 0)
-        goals.append(state.obs[:, env.state_dim :])
-        assert (np.abs(state.obs[:, :2]) <= 0.1).all()
+        obs = np.asarray(state.obs)
+        goals.append(obs[:, env.state_dim :])
+        assert (np.abs(obs[:, :2]) <= 0.1).all()
     assert len(np.unique(np.concatenate(goals), axis=0)) == 5 * B
 
 
@@ -74,7 +75,7 @@ def test_final_obs_flags_and_reward_are_those_of_the_finished_step(env):
     np.testing.assert_array_equal(state.info["truncation"], np.ones(B))
     np.testing.assert_array_equal(state.reward, expected.reward)
     np.testing.assert_array_equal(state.metrics["distance"], expected.metrics["distance"])
-    assert (state.obs != expected.obs).any(axis=1).all()
+    assert (np.asarray(state.obs) != expected.obs).any(axis=1).all()
     np.testing.assert_array_equal(step(state, act(env)).done, np.zeros(B))
 
 
@@ -92,7 +93,7 @@ def test_only_the_environments_that_finish_are_reset(env):
     vector = batch()
     step = jitted(vector.step)
     state = step(begin(vector), act(env))
-    state = jax.jit(vector.reset_where)(state, jnp.array([True, False, False, False]), jax.random.key(1))
+    state = jax.jit(vector.reset_where)(state, np.array([True, False, False, False]), jax.random.key(1))
     for _ in range(2):
         state = step(state, act(env))
     np.testing.assert_array_equal(state.done, [0.0, 1.0, 1.0, 1.0])
@@ -106,8 +107,8 @@ def test_reset_where_resets_everything_of_the_masked_and_nothing_else(name):
     reset, step = jitted(vector.reset), jitted(vector.step)
     before = reset(jax.random.key(0))
     for _ in range(2):
-        before = step(before, jnp.ones((B, vector.env.action_size)))
-    after = jax.jit(vector.reset_where)(before, jnp.asarray(mask), jax.random.key(7))
+        before = step(before, np.ones((B, vector.env.action_size), np.float32))
+    after = jax.jit(vector.reset_where)(before, mask, jax.random.key(7))
     fresh = reset(jax.random.key(7))
     for old, new, start in zip(leaves(before), leaves(after), leaves(fresh), strict=True):
         np.testing.assert_array_equal(new[~mask], old[~mask])
@@ -123,13 +124,12 @@ def test_environments_of_a_batch_differ():
 def test_a_vmap_over_seeds_equals_a_loop_over_them(name, auto_reset):
     vector = batch(name, auto_reset)
     states = jax.jit(jax.vmap(vector.reset))(jax.random.split(jax.random.key(0), 3))
-    actions = jax.random.uniform(jax.random.key(1), (3, 5, B, vector.env.action_size), minval=-1, maxval=1)
-    together = jax.jit(jax.vmap(lambda *seed: rollout(vector, *seed)))(states, actions)
-    single = jax.jit(lambda *seed: rollout(vector, *seed))
-    seeds = [jax.tree.map(lambda leaf, i=i: leaf[i], (states, actions)) for i in range(3)]
-    apart = jax.tree.map(lambda *leaf: jnp.stack(leaf), *[single(*seed) for seed in seeds])
-    for a, b in zip(leaves(together), leaves(apart), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
+    actions = np.random.default_rng(1).uniform(-1, 1, (3, 5, B, vector.env.action_size)).astype(np.float32)
+    together = leaves(jax.jit(jax.vmap(lambda *seed: rollout(vector, *seed)))(states, actions))
+    single = jax.jit(lambda states, actions, i: rollout(vector, *jax.tree.map(lambda leaf: leaf[i], (states, actions))))
+    for i in range(3):
+        for a, b in zip(together, leaves(single(states, actions, i)), strict=True):
+            np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-5)
 
 
 def test_any_number_of_vmaps_is_one_batch_for_the_environment(monkeypatch):
@@ -146,7 +146,7 @@ def test_any_number_of_vmaps_is_one_batch_for_the_environment(monkeypatch):
     monkeypatch.setattr(env, "step", spied_step)
     vector = envs.VectorEnv(env, B, auto_reset=False)
     state = jax.jit(jax.vmap(jax.vmap(vector.reset)))(jax.random.split(jax.random.key(0), (2, 3)))
-    state = jax.jit(jax.vmap(jax.vmap(vector.step)))(state, jnp.zeros((2, 3, B, 2)))
+    state = jax.jit(jax.vmap(jax.vmap(vector.step)))(state, np.zeros((2, 3, B, 2), np.float32))
     assert state.reward.shape == (2, 3, B)
     assert seen == [(2 * 3 * B, env.observation_size)]
 
@@ -156,14 +156,14 @@ def test_an_action_shared_by_all_seeds_is_broadcast(env):
     state = jax.jit(jax.vmap(vector.reset))(jax.random.split(jax.random.key(0), 3))
     action = act(env)
     shared = jax.jit(jax.vmap(vector.step, in_axes=(0, None)))(state, action)
-    repeated = jax.jit(jax.vmap(vector.step))(state, jnp.broadcast_to(action, (3, *action.shape)))
+    repeated = jax.jit(jax.vmap(vector.step))(state, np.broadcast_to(action, (3, *action.shape)))
     for a, b in zip(leaves(shared), leaves(repeated), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_typed_keys_are_carried_like_raw_ones(env):
     vector = batch()
-    ended = jnp.full((B, env.action_size), jnp.nan)  # ends every episode, so that the carried keys are used
+    ended = np.full((B, env.action_size), np.nan, np.float32)  # ends every episode, so that the carried keys are used
     typed, raw = (
         jitted(vector.step)(jitted(vector.reset)(key), ended) for key in (jax.random.key(3), jax.random.PRNGKey(3))
     )
@@ -181,7 +181,7 @@ def test_a_key_for_each_environment_begins_the_episode_of_that_environment_alone
     for i in range(B):
         np.testing.assert_array_equal(begun.obs[i], reset_one(keys[i : i + 1]).obs[0])
     state = reset(jax.random.key(7))
-    mask = jnp.arange(B) == 2
+    mask = np.arange(B) == 2
     np.testing.assert_array_equal(jax.jit(vector.reset_where)(state, mask, keys).obs[2], begun.obs[2])
     with pytest.raises(UserError, match=rf"the shape of the keys is \(2,\); allowed: one key, or \({B},\)"):
         vector.reset(keys[:2])
@@ -192,20 +192,25 @@ def test_the_derivative_of_a_batch_is_that_of_each_environment(env, auto_reset):
     vector = batch(auto_reset=auto_reset)
     state, action = begin(vector), 0.5 * act(env)
 
-    def rewards(action):
-        return vector.step(state, action).reward
+    @jax.jit
+    def derivatives(state, action, pair):
+        def rewards(action):
+            return vector.step(state, action).reward
 
-    each = jax.jit(jax.vmap(jax.grad(lambda one, action: env.step(one, action).reward, argnums=1)))(state, action)
-    assert (jnp.abs(each) > 0).any()
-    forward = jax.jit(jax.jacfwd(rewards))(action)
-    np.testing.assert_allclose(jnp.einsum("iij->ij", forward), each, rtol=1e-5)
-    pair = jnp.stack([action, action])
-    for expected, found in (
-        (each, jax.jit(jax.grad(lambda a: rewards(a).sum()))(action)),
-        (jnp.stack([each, each]), jax.jit(jax.vmap(jax.grad(lambda a: rewards(a).sum())))(pair)),
-        (jnp.stack([each, each]), jax.jit(jax.grad(lambda a: jax.vmap(rewards)(a).sum()))(pair)),
-    ):
-        np.testing.assert_allclose(found, expected, rtol=1e-5)
+        return (
+            jax.vmap(jax.grad(lambda one, action: env.step(one, action).reward, argnums=1))(state, action),
+            jax.jacfwd(rewards)(action),
+            jax.grad(lambda a: rewards(a).sum())(action),
+            jax.vmap(jax.grad(lambda a: rewards(a).sum()))(pair),
+            jax.grad(lambda a: jax.vmap(rewards)(a).sum())(pair),
+        )
+
+    each, forward, summed, *pairs = map(np.asarray, derivatives(state, action, np.stack([action, action])))
+    assert (np.abs(each) > 0).any()
+    np.testing.assert_allclose(np.einsum("iij->ij", forward), each, rtol=1e-5)
+    np.testing.assert_allclose(summed, each, rtol=1e-5)
+    for found in pairs:
+        np.testing.assert_allclose(found, np.stack([each, each]), rtol=1e-5)
 
 
 def test_an_engine_without_derivatives_says_so_in_one_line():

@@ -41,6 +41,8 @@ def slow_ranks(known, task, goal, *, procedures=False):
 
 
 find = jax.jit(memory.neighbours, static_argnames=("k", "procedures"))
+distances, nearest = jax.jit(memory.distances), jax.jit(memory.nearest)
+regress, action = jax.jit(inverse.regress), jax.jit(inverse.action)
 
 
 @settings(max_examples=8)
@@ -63,22 +65,22 @@ def test_neighbours_are_those_that_a_slow_search_finds(seed, task, rows, procedu
 def test_distances_to_what_is_known_are_those_of_a_slow_search(seed, rows):
     known = filled(seed, rows, share=0.01)
     found = np.random.default_rng(seed).uniform(0, 0.5, (3, 6, 4)).astype(np.float32)
-    fast = jax.jit(memory.distances)(known, rows, jnp.asarray(found))
+    fast = distances(known, rows, jnp.asarray(found))
     slow = [[slow_ranks(known, task, goal)[0].min() for task, goal in enumerate(one)] for one in found]
     np.testing.assert_allclose(fast, np.minimum(slow, FAR), atol=1e-6, rtol=1e-6)
-    one = jax.jit(memory.nearest)(known, rows, 4, jnp.asarray(found[1, 4]))
+    one = nearest(known, rows, 4, jnp.asarray(found[1, 4]))
     assert float(one) == pytest.approx(float(fast[1, 4]), abs=1e-6)
 
 
 def test_an_empty_memory_knows_nothing_and_rows_are_found_as_soon_as_they_are_written():
-    known = memory.empty(WORLD, 10)
-    goal = jnp.zeros(4)
-    assert memory.nearest(known, 0, 0, goal) == FAR and not memory.neighbours(known, 0, 0, goal, k=3).known.any()
-    new = jax.tree.map(lambda leaf: leaf[:2], memory.empty(WORLD, 10)).replace(
-        outcomes=jnp.full((6, 4, 2), FAR).at[0, :, 1].set(0.25), reached=jnp.array([1, 0, 0, 0, 0, 0])
-    )
-    known = memory.write(known, jnp.int32(CHUNK - 2), new)
-    near = memory.neighbours(known, CHUNK, 0, goal, k=3)
+    known = jax.device_get(memory.empty(WORLD, 10))
+    goal = np.zeros(4, np.float32)
+    assert nearest(known, 0, 0, goal) == FAR and not np.asarray(find(known, 0, 0, goal, k=3).known).any()
+    outcomes = np.full((6, 4, 2), FAR, np.float32)
+    outcomes[0, :, 1] = 0.25
+    new = jax.tree.map(lambda leaf: leaf[:2], known).replace(outcomes=outcomes, reached=np.array([1, 0, 0, 0, 0, 0]))
+    known = jax.jit(memory.write)(known, np.int32(CHUNK - 2), new)
+    near = jax.device_get(find(known, CHUNK, 0, goal, k=3))
     assert near.rows[0] == CHUNK - 1 and near.distances[0] == 0.5 and near.known.tolist() == [True, False, False]
     assert known.reached.tolist() == [1, 0, 0, 0, 0, 0]
 
@@ -100,9 +102,7 @@ def test_the_inverse_model_is_weighted_ridge_regression(seed, count):
     inputs, outputs = rng.uniform(0, 0.5, (10, 4)), rng.uniform(-1, 1, (10, 6))
     goal, used = rng.uniform(0, 0.5, 4), np.arange(10) < count
     distances = np.linalg.norm(inputs - goal, axis=1)
-    fast = inverse.regress(
-        *(jnp.asarray(x, jnp.float32) for x in (inputs, outputs, distances)), jnp.asarray(used), goal
-    )
+    fast = regress(*(x.astype(np.float32) for x in (inputs, outputs, distances)), used, goal.astype(np.float32))
     reach = 2 * (distances[used].min() + inverse.CLOSE)
     weights = np.exp(-((distances[used] / reach) ** 2))
     weights /= weights.sum()
@@ -117,19 +117,18 @@ def test_the_inverse_model_is_weighted_ridge_regression(seed, count):
 def test_two_ways_of_doing_it_are_not_averaged():
     """Neighbours of another length, or of quite other actions, do not count; too few leave the best one as it is."""
     rng = np.random.default_rng(0)
-    known = memory.empty(WORLD, 10)
+    known = jax.device_get(memory.empty(WORLD, 10))
     one, other = np.full((4, 14), 0.5), np.full((4, 14), -0.5)
     ways = np.stack([one, *[one + 0.02 * rng.normal(size=one.shape) for _ in range(5)], *[other] * 4])
-    known = known.replace(
-        sequences=known.sequences.at[:10].set(jnp.asarray(ways, jnp.float32)),
-        lengths=known.lengths.at[:10].set(jnp.array([2] * 5 + [3] * 5)),
-    )
-    outcomes = jnp.asarray(rng.uniform(0.2, 0.3, (10, 4)), jnp.float32)
-    goal = jnp.full(4, 0.25)
-    near = Neighbours(jnp.arange(10), outcomes, jnp.linalg.norm(outcomes - goal, axis=1))
-    found = inverse.action(known, near, goal, jnp.array(3))
-    assert jnp.abs(found[:2] - 0.5).max() < 0.1 and not jnp.array_equal(found, known.sequences[0])
-    assert jnp.array_equal(inverse.action(known, near, goal, jnp.array(5)), known.sequences[0])
+    sequences, lengths = known.sequences.copy(), known.lengths.copy()
+    sequences[:10], lengths[:10] = ways, [2] * 5 + [3] * 5
+    known = known.replace(sequences=sequences, lengths=lengths)
+    outcomes = rng.uniform(0.2, 0.3, (10, 4)).astype(np.float32)
+    goal = np.full(4, 0.25, np.float32)
+    near = Neighbours(np.arange(10), outcomes, np.linalg.norm(outcomes - goal, axis=1))
+    found = np.asarray(action(known, near, goal, 3))
+    assert np.abs(found[:2] - 0.5).max() < 0.1 and not np.array_equal(found, sequences[0])
+    np.testing.assert_array_equal(action(known, near, goal, 5), sequences[0])
 
 
 def test_a_memory_has_room_for_what_is_asked_for():

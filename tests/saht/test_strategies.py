@@ -3,7 +3,6 @@
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -37,12 +36,22 @@ def chosen():
 
 @pytest.fixture(scope="module")
 def propose(chosen):
-    return jax.jit(lambda known, rows, order, key: strategies.propose(chosen, known, rows, order, key=key))
+    made = jax.jit(lambda known, rows, order, key: strategies.propose(chosen, known, rows, order, key=key))
+    return lambda *args: jax.device_get(made(*args))
 
 
 def order(task, goal, way, first=True):
-    scaled = (jnp.asarray(goal) - SCALE.lower[task]) / SCALE.width[task]
-    return Order(jnp.int32(task), scaled.astype(jnp.float32), jnp.int32(way), jnp.asarray(first))
+    scaled = (np.asarray(goal) - SCALE.lower[task]) / SCALE.width[task]
+    return Order(np.int32(task), scaled.astype(np.float32), np.int32(way), np.asarray(first))
+
+
+@jax.jit
+def carried_out(made):
+    """What comes of sequences, to be remembered."""
+    return loop.execute(SimpleNamespace(world=PEN, scale=SCALE), made, key=jax.random.key(0))[0]
+
+
+write = jax.jit(memory.write)
 
 
 @pytest.fixture(scope="module")
@@ -51,61 +60,63 @@ def skilled():
     known, row = memory.empty(PEN, 200), 0
     for task in (TIP, STICK_1, STICK_2):
         sequences, lengths = PEN.demonstrate(task, PEN.benchmark(task)[:60])
-        plain = proposals.plain((sequences, lengths))
-        found, _ = loop.execute(SimpleNamespace(world=PEN, scale=SCALE), plain, key=jax.random.key(0))
-        known, row = memory.write(known, jnp.int32(row), found), row + 60
+        plain = jax.jit(proposals.plain)((sequences, lengths))
+        known, row = write(known, np.int32(row), carried_out(plain)), row + 60
     return known, row
 
 
 def executed(made):
-    return PEN.execute(made.sequences, made.lengths)
+    return jax.device_get(PEN.execute(made.sequences, made.lengths))
 
 
 def test_random_sequences_are_anywhere_and_each_primitive_more_is_half_as_likely():
-    dice = Dice.thrown(PEN, 4000, key=jax.random.key(0))
-    sequences, lengths = strategies.anywhere(Setting(PEN, SCALE, (), None, 4000), dice)
+    setting = Setting(PEN, SCALE, (), None, 4000)
+    sequences, lengths = jax.device_get(
+        jax.jit(lambda key: strategies.anywhere(setting, Dice.thrown(PEN, 4000, key=key)))(jax.random.key(0))
+    )
     counts = np.bincount(np.asarray(lengths), minlength=5)[1:] / 4000
     np.testing.assert_allclose(counts, np.array([8, 4, 2, 1]) / 15, atol=0.03)
-    assert jnp.abs(sequences.mean()) < 0.01 and sequences.min() < -0.99 and sequences.max() > 0.99
+    assert abs(sequences.mean()) < 0.01 and sequences.min() < -0.99 and sequences.max() > 0.99
 
 
 def test_alone_a_learner_stays_near_what_is_known_the_more_the_nearer_it_is(skilled, propose):
     known, rows = skilled
     goal = PEN.benchmark(TIP)[3]  # which is in memory
     made = propose(known, rows, order(TIP, goal, ACTIONS), jax.random.key(1))
-    near = jnp.linalg.norm(executed(made).value[:, TIP] - goal, axis=-1) < 0.2
+    near = np.linalg.norm(executed(made).value[:, TIP] - goal, axis=-1) < 0.2
     assert near.sum() >= 7 and (made.pair == -1).all()  # nine of ten stay near, with little noise
     far = propose(memory.empty(PEN, 200), 0, order(TIP, goal, ACTIONS), jax.random.key(1))
-    assert (jnp.linalg.norm(executed(far).value[:, TIP] - goal, axis=-1) < 0.2).sum() <= 2
+    assert (np.linalg.norm(executed(far).value[:, TIP] - goal, axis=-1) < 0.2).sum() <= 2
 
 
 def test_a_teacher_of_actions_is_repeated_exactly_at_first_and_then_with_noise(skilled, chosen, propose):
     asked = order(CHARACTER, PEN.benchmark(CHARACTER)[0], MIMIC)
     made = propose(*skilled, asked, jax.random.key(0))
-    shown = chosen.shown.sequences[0]
-    nearest = np.argmin(np.linalg.norm(chosen.shown.outcomes[0] - asked.goal, axis=-1))
-    assert jnp.array_equal(made.sequences[0], shown[nearest])
+    shown = np.asarray(chosen.shown.sequences)[0]
+    nearest = np.argmin(np.linalg.norm(np.asarray(chosen.shown.outcomes)[0] - asked.goal, axis=-1))
+    assert np.array_equal(made.sequences[0], shown[nearest])
     varied = made.sequences[1:] - shown[nearest]
     assert 0.03 < varied.std() < 0.06 and (made.lengths == 4).all()
-    later = propose(*skilled, asked._replace(first=jnp.asarray(False)), jax.random.key(0))
-    assert not jnp.array_equal(later.sequences[0], shown[nearest])
+    later = propose(*skilled, asked._replace(first=np.asarray(False)), jax.random.key(0))
+    assert not np.array_equal(later.sequences[0], shown[nearest])
 
 
 def test_a_teacher_of_another_task_shows_any_of_his(skilled, chosen, propose):
-    asked = order(TIP, jnp.zeros(4), ANOTHER)
-    first = [np.asarray(propose(*skilled, asked, jax.random.key(seed)).sequences[0]) for seed in range(12)]
-    shown = np.asarray(chosen.shown.sequences[2])
+    asked = order(TIP, np.zeros(4), ANOTHER)
+    first = [propose(*skilled, asked, jax.random.key(seed)).sequences[0] for seed in range(12)]
+    shown = np.asarray(chosen.shown.sequences)[2]
     which = [int(np.abs(shown - one).sum((1, 2)).argmin()) for one in first]
     assert len(set(which)) >= 3
     np.testing.assert_allclose(first, shown[which], atol=1e-6)
 
 
 def test_a_teacher_of_outcomes_makes_his_outcome_the_goal(skilled, chosen, propose):
-    task, goal = strategies.aim(chosen, order(STICK_1, PEN.benchmark(STICK_1)[0], EMULATE))
-    assert task == STICK_1 and (np.linalg.norm(chosen.shown.outcomes[3] - goal, axis=-1) == 0).any()
-    task, goal = strategies.aim(chosen, order(TIP, jnp.zeros(4), ACTIONS))
-    assert task == TIP and jnp.array_equal(goal, order(TIP, jnp.zeros(4), ACTIONS).goal)
-    made = propose(*skilled, order(TIP, jnp.zeros(4), EMULATE), jax.random.key(0))
+    aim = jax.jit(lambda order: strategies.aim(chosen, order))
+    task, goal = jax.device_get(aim(order(STICK_1, PEN.benchmark(STICK_1)[0], EMULATE)))
+    assert task == STICK_1 and (np.linalg.norm(np.asarray(chosen.shown.outcomes)[3] - goal, axis=-1) == 0).any()
+    task, goal = aim(order(TIP, np.zeros(4), ACTIONS))
+    assert task == TIP and np.array_equal(goal, order(TIP, np.zeros(4), ACTIONS).goal)
+    made = propose(*skilled, order(TIP, np.zeros(4), EMULATE), jax.random.key(0))
     assert executed(made).reached[:, STICK_1].mean() > 0.4  # though the task is another
 
 
@@ -122,31 +133,29 @@ def test_a_teacher_of_procedures_names_two_goals_and_what_reached_the_nearest_is
 def test_alone_a_learner_makes_procedures_of_any_two_tasks_that_were_reached(skilled, propose):
     pairs = set()
     for seed in range(20):
-        made = jax.device_get(propose(*skilled, order(CHARACTER, jnp.zeros(4), PROCEDURES), jax.random.key(seed)))
+        made = propose(*skilled, order(CHARACTER, np.zeros(4), PROCEDURES), jax.random.key(seed))
         pairs |= {divmod(int(pair), 6) for pair in made.pair if pair >= 0}
         assert ((made.pair < 0) | (np.abs(made.subgoals[..., 0]) < FAR / 2).all(axis=1)).all()
     assert len(pairs) >= 5 and {task for pair in pairs for task in pair} == {TIP, STICK_1, STICK_2, CHARACTER}
 
 
-def test_procedures_that_reached_a_goal_are_made_again_for_goals_near_it(skilled, chosen, propose):
+def test_procedures_that_reached_a_goal_are_made_again_for_goals_near_it(skilled, propose):
     known, rows = skilled
     goals = PEN.benchmark(CHARACTER)
     for number in range(8):
         taught = propose(known, rows, order(CHARACTER, goals[number], DECOMPOSE), jax.random.key(0))
-        found, _ = loop.execute(chosen, taught, key=jax.random.key(0))
-        known, rows = memory.write(known, jnp.int32(rows), found), rows + G
+        known, rows = write(known, np.int32(rows), carried_out(taught)), rows + G
     asked, mine = order(CHARACTER, goals[3], PROCEDURES), STICK_1 * 6 + STICK_2
     made = [propose(known, rows, asked, jax.random.key(seed)) for seed in range(10)]
     local = [one for one in made if (one.pair == mine).all()]
     assert len(local) >= 6
-    error = [jnp.linalg.norm(executed(one).value[:, CHARACTER] - goals[3], axis=-1).min() for one in local]
+    error = [np.linalg.norm(executed(one).value[:, CHARACTER] - goals[3], axis=-1).min() for one in local]
     assert np.median(error) < 0.25
 
 
-def test_what_does_not_fit_into_a_sequence_is_not_made(chosen, propose):
+def test_what_does_not_fit_into_a_sequence_is_not_made(propose):
     """Two sequences of the character's, of four primitives each, make none: then anything is tried."""
-    taught = proposals.plain(PEN.demonstrate(CHARACTER, PEN.benchmark(CHARACTER)[:60]))
-    found, _ = loop.execute(chosen, taught, key=jax.random.key(0))
-    full = memory.write(memory.empty(PEN, 200), jnp.int32(0), found)
-    made = propose(full, 60, order(CHARACTER, jnp.zeros(4), PROCEDURES), jax.random.key(0))
+    taught = jax.jit(proposals.plain)(PEN.demonstrate(CHARACTER, PEN.benchmark(CHARACTER)[:60]))
+    full = write(memory.empty(PEN, 200), np.int32(0), carried_out(taught))
+    made = propose(full, 60, order(CHARACTER, np.zeros(4), PROCEDURES), jax.random.key(0))
     assert (made.pair == -1).all() and (made.lengths < 4).any()

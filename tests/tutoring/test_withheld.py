@@ -124,8 +124,13 @@ def test_simulated_students_do_without_the_skill_that_was_drawn_for_them(monkeyp
             "discovery": {"students": 12, "exercises": 20},
         }
     )
-    course = students.draw_course(hyper.course, key=random.key(0))
-    lot, scores = jax.jit(lambda key: experiment.withheld_scores(hyper, course, key=key))(random.key(1))
+
+    @jax.jit
+    def drawn(key):
+        course = students.draw_course(hyper.course, key=key)
+        return course, experiment.withheld_scores(hyper, course, key=random.fold_in(key, 1))
+
+    course, (lot, scores) = jax.device_get(drawn(random.key(0)))
     assert np.bincount(lot).tolist() == [3, 3, 3, 3] and lot.tolist() != (np.arange(12) % 4).tolist()
     needed = np.asarray(course.needs)[scores.exercise]
     assert scores.student.tolist() == np.repeat(np.arange(12), 20).tolist()

@@ -61,7 +61,8 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     errand = errands[number]
     key = modes.key(options.evaluation_seed)
     path = np.asarray(tested(program.hyper, experiment.room, [errand], state, key=key)[0])
-    (table,) = experiment.tables(program.hyper, jax.tree.map(lambda leaf: leaf[None], state), [options.seed or 0])
+    alone = jax.tree.map(lambda leaf: leaf[None], jax.device_get(state.replace(key=None)))
+    (table,) = experiment.tables(program.hyper, alone, [options.seed or 0])
     height = options.height or 340
     steps = video.moments(options.out, len(path), every=options.every)
     drawn = _pictures(experiment.room, errand, path, table["models"], steps=steps, height=height)
