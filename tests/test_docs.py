@@ -277,37 +277,37 @@ def test_the_papers_config_has_the_published_values():
     assert seen > 20
 
 
-def metrics(overrides):
-    """The names of an epoch's metrics."""
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        pytest.param({}, id="ppo"),
+        pytest.param(
+            {
+                "tutor.learner": "td3",
+                "controller.learner": "td3",
+                "tutor.adjacency.enabled": True,
+                "sgim.teachers": [{"name": "guide", "kind": "decomposition"}],
+            },
+            id="td3, adjacency, sgim",
+        ),
+    ],
+)
+def test_every_metric_is_explained_and_every_explained_metric_exists(overrides):
     program = programs.build(parse({"env": {"name": "point_maze"}, "trainer": {"num_envs": 8}}, overrides))
-    return set(jax.eval_shape(program.epoch, program.example())[1])
-
-
-def explained(learner):
-    """What the page explains of levels that learn by `learner`, and of all that is no level's."""
-    return {
+    state = jax.eval_shape(program.init, program.seed_keys())
+    metrics = set(jax.eval_shape(program.epoch, state)[1])
+    learner = {"PPO", "both"} if not overrides else {"TD3", "both"}
+    explained = {
         key
         for key, second, *_ in rows("docs/metrics.md")
-        if not key.startswith(("tutor/", "controller/")) or second in (learner, "both")
+        if not key.startswith(("tutor/", "controller/")) or second in learner
+        if overrides or not key.startswith(("adjacency/", "sgim/"))
     }
-
-
-def test_every_metric_is_explained_and_every_explained_metric_exists():
-    teachers = [{"name": "guide", "kind": "decomposition"}]
-    td3 = {"tutor.learner": "td3", "controller.learner": "td3", "tutor.adjacency.enabled": True}
-    told = explained("TD3")
     names = {"share": ("autonomous", "guide"), "queries": ("guide",)}
-    for each in [key for key in told if key.endswith("_NAME")]:
+    for each in [key for key in explained if key.endswith("_NAME")]:
         kind = each.removeprefix("sgim/").removesuffix("_NAME")
-        told = told - {each} | {f"sgim/{kind}_{name}" for name in names[kind]}
-    assert told == metrics(td3 | {"sgim.teachers": teachers}) | WRITTEN_BY_THE_TRAINER
-
-
-def test_every_metric_of_levels_that_learn_by_ppo_is_explained_and_every_explained_one_exists():
-    """Without a Commander, whose metrics are those beside TD3: to trace it takes longer than both levels."""
-    found, told = metrics({"commander.enabled": False}), explained("PPO")
-    of_levels = {key for key in told if key.startswith(("tutor/", "controller/"))}
-    assert of_levels <= found <= told
+        explained = explained - {each} | {f"sgim/{kind}_{name}" for name in names[kind]}
+    assert explained == metrics | WRITTEN_BY_THE_TRAINER
 
 
 def test_the_example_of_the_metrics_page_runs(folder):

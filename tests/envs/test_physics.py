@@ -69,12 +69,9 @@ def test_mjx_engine_agrees_with_native(body):
     plain.qpos = data.qpos[0]
     mujoco.mj_forward(body.physics.model, plain)
     assert plain.ncon > 1
-    step = jax.jit(mjx_body.physics.step)  # one by one: a batch takes as long again to trace, and is the same code
-    data = jax.device_get(data)
-    for i in range(4):
-        mjx = step(jax.tree.map(lambda leaf, i=i: leaf[i], data), np.float32(ctrl[i]))
-        np.testing.assert_allclose(mjx.qpos, native.qpos[i], atol=1e-3)
-        np.testing.assert_allclose(mjx.qvel, native.qvel[i], atol=1e-3)
+    mjx = jax.jit(jax.vmap(mjx_body.physics.step))(data, ctrl)
+    np.testing.assert_allclose(mjx.qpos, native.qpos, atol=1e-3)
+    np.testing.assert_allclose(mjx.qvel, native.qvel, atol=1e-3)
     assert (np.asarray(native.qvel) != np.asarray(data.qvel)).all()
 
 

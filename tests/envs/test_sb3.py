@@ -7,7 +7,7 @@ import pytest
 
 PAGE = Path(__file__).parents[2] / "docs" / "gymnasium.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-EPISODES = 20
+EPISODES = 40
 
 
 @pytest.fixture(scope="module")

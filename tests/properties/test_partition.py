@@ -123,7 +123,7 @@ def test_points_outside_go_to_the_nearest_region(d, capacity, seed, far):
     lower, upper = (np.asarray(x, np.float64)[:count] for x in (made.lower, made.upper))
     rng = np.random.default_rng(seed)
     low, high = (np.float64(np.float32(corner)) for corner in SPACES[d][0])
-    points = rng.uniform(low - far, high + far, (POINTS, d)).astype(np.float32)
+    points = rng.uniform(low - far, high + far, (3 * POINTS, d)).astype(np.float32)
     away = np.maximum(np.maximum(lower - points[:, None], points[:, None] - upper), 0)
     distance = np.linalg.norm(away, axis=-1)
     found = np.asarray(locator(d, capacity)(made, points))

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from star.abstraction import reachability
 from star.abstraction.reachability import Network, Zonotope
 
-POINTS = 30_000
+POINTS = 100_000
 ARCHITECTURES = [  # widths of input, hidden layers and output; residual
     ((2, 2), False),
     ((3, 3), True),
