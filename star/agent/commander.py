@@ -84,7 +84,7 @@ def blank(position: Float[Array, "B d"]) -> Memory:
     return Memory(
         clock=nothing,
         practice=nothing - 1,
-        region=nothing - 1,
+        region=nothing,
         goal_region=nothing,
         target=nothing,
         box=Box(lower=jnp.zeros_like(position), upper=jnp.zeros_like(position)),

@@ -30,7 +30,7 @@ class Memory(struct.PyTreeNode):
     practice: Int[Array, "B"]
     """The region that an environment practises to reach; -1 where it pursues the goal of the task."""
     region: Int[Array, "B"]
-    """Region in which the period began; -1 before the first."""
+    """Region in which the period began."""
     goal_region: Int[Array, "B"]
     target: Int[Array, "B"]
     box: Box

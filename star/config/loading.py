@@ -142,16 +142,16 @@ def parse(
     `source` says in errors where the values come from, and `typed` where the overrides do. What is `kept` by a run or a
     checkpoint names all settings that there were: one that it does not name is newer, and one may be gone.
     """
-    nested = _with_overrides(plain(values), plain(overrides or {}))
+    given, told = plain(values), plain(overrides or {})
     try:
-        kind = kinds.find(nested.get("experiment", DEFAULT))
+        kind = kinds.find(told.get("experiment", given.get("experiment", DEFAULT)))
     except UserError as error:
         culprit = typed if "experiment" in (overrides or {}) else source
         raise ConfigError(f"{culprit}: {error}") from None
     model = kind.Config
+    nested = _with_overrides(_without(given, kind.gone) if kept else given, told)
     if kept:
-        named = _with_overrides(_without(plain(values), kind.gone), plain(overrides or {}))
-        nested = _merged(_with_overrides({}, kind.older), named)
+        nested = _merged(_with_overrides({}, kind.older), nested)
     try:
         return model.model_validate(nested)
     except ValidationError as error:
