@@ -5,21 +5,18 @@
 
 `envs` knows nothing of agents. See docs/environments.md for every task, option and convention, and docs/your_robot.md
 for environments of your own; `envs.worlds` is for learners of skills (docs/worlds.md). Modules that need JAX are
-imported at their first use. With Gymnasium installed, its ids of the tasks are registered (docs/gymnasium.md).
+imported at their first use. Gymnasium knows the tasks by their ids from then on (docs/gymnasium.md).
 """
 
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from typing import TYPE_CHECKING, Any
 
+from envs import registration as registration
 from envs.common.errors import UserError
 from envs.options import EnvError
 from envs.tasks import names
-
-if importlib.util.find_spec("gymnasium"):
-    from envs import registration as registration
 
 if TYPE_CHECKING:
     from envs.arena import Arena, read_arena

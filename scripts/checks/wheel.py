@@ -26,9 +26,9 @@ SMALL = (
     "--commander.enabled false --tutor.enabled false"  # the Controller alone compiles in a fifth of the time
 )
 ACT = """
-import envs, gymnasium, star
+import star
 agent = star.load("point_maze")
-env = gymnasium.make("star/PointMaze-v0", goals="test")
+env = agent.env()
 obs, info = env.reset(seed=0)
 for _ in range(20): obs, *_ = env.step(agent.act(obs))
 print(star.__file__, obs["achieved_goal"])

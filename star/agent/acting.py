@@ -18,7 +18,7 @@ import numpy as np
 from jax import export
 from jaxtyping import Array, Float
 
-from envs.common import files
+from envs.common import files, plugins
 from envs.common.errors import UserError
 from star.agent import commands, hierarchy, levels
 from star.agent.decisions import Memory, Roadmap
@@ -144,6 +144,19 @@ class TrainedAgent:
         episode.before, episode.steps = batch, episode.steps + 1
         episode.shape = given.shape[:-1]
         return np.clip(np.asarray(action), -1.0, 1.0).reshape(*episode.shape, -1)
+
+    def env(self, **options: Any) -> Any:
+        """Its task as an `envs.gym.GymEnv` with test goals and the options of its run; `options` go before these.
+
+        Raises:
+          UserError: in one line, for an environment of the user's own, or a wrong option.
+        """
+        section = self.config.env
+        if plugins.is_plugin(section.name):
+            raise UserError(f"env: {section.name} is an environment of your own: make it, and give its obs to act")
+        from envs.gym import GymEnv  # it imports what acting alone does not need
+
+        return GymEnv(section.name, **{"engine": section.engine, "goals": "test"} | section.options | options)
 
     def render(self, path: str | Path, *, force: bool = False, **how: Any) -> str:
         """Write a picture or a film of a test episode, and return a line about it; the ending of `path` decides.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -97,8 +96,6 @@ def render(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
                 raise ConfigError(f"--{key}: random actions take only env settings and trainer.device")
         if options.goals != "test":
             raise ConfigError(f"--goals: {options.goals} needs --run; random actions take --env.options.goals")
-        if os.path.isfile(Path(options.task, "config.yaml")):
-            raise ConfigError(f"star render: {options.task} is a run, not a task; did you mean --run {options.task}?")
         task: dict[str, Any] = {}
         config = parse({}, overrides | {"env.name": options.task})
     else:

@@ -115,16 +115,21 @@ class Star(Experiment):
         return found
 
     def notes(self) -> list[str]:
-        """Levels that learn from old transitions: how often from each, on average."""
+        """A user's map that marks no goal, and levels that learn from old transitions: how often from each."""
         said = [(name, level.settings.samples_per_transition(size)) for name, level, size in self.config.learners()]
-        return [f"{name}: {samples:.3g} samples per new transition" for name, samples in said if samples is not None]
+        notes = [f"{name}: {samples:.3g} samples per new transition" for name, samples in said if samples is not None]
+        if "map" in self.config.env.options and not any(self.test_env.arena.cells(arena.GOAL)):
+            x, y = self.goal[:2]
+            where = f"x {x:g} m, y {y:g} m from the start, the longest walk"
+            notes.append(f'env.options.map: no cell is "{arena.GOAL}"; the goal of tests is at {where}')
+        return notes
 
     def facts(self, rows: Sequence[Mapping[str, Any]]) -> Mapping[str, str]:
-        """Regions and edges, SGIM's strategies, and faults of the simulator."""
+        """Regions and pairs of them, SGIM's strategies, and faults of the simulator."""
         found = {}
         regions, edges = mean(rows, "abstraction/regions"), mean(rows, "refinement/edges")
         if regions is not None:
-            found["regions"] = f"{regions:.0f}" + ("" if edges is None else f", {edges:.0f} edges")
+            found["regions"] = f"{regions:.0f}" + ("" if edges is None else f", {edges:.0f} pairs reach")
         shares = [key for row in rows[:1] for key in row if key.startswith(_SHARE)]
         if shares:
             named = {key.removeprefix(_SHARE): mean(rows, key) for key in shares}

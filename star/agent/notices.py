@@ -21,7 +21,7 @@ def notices(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     full = next((row for row in rows if row.get("refinement/table_full") == 1), None)
     if full is not None:
         found["room"] = (
-            f"the table of regions is full, {full['abstraction/regions']:.0f} since {full['env_steps']:,} env steps; "
+            f"the table of regions is full, {full['abstraction/regions']:.0f} since env step {full['env_steps']:,}; "
             "abstraction.max_regions makes room"
         )
     success = [row["eval/success_final"] for row in rows if row.get("eval/success_final") is not None]
@@ -31,6 +31,6 @@ def notices(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
         since = next(i for i, share in enumerate(ground) if share >= enough)
         if len(rows) - 1 - since >= PATIENCE:
             found["frontier"] = (
-                f"no new ground since {rows[since]['env_steps']:,} env steps, and success_final is below {ENOUGH:g}"
+                f"no new ground since env step {rows[since]['env_steps']:,}, and success_final is below {ENOUGH:g}"
             )
     return found

@@ -25,7 +25,9 @@ A setting of the task is given as --env.options.KEY VALUE."""
 def add(parser: argparse.ArgumentParser) -> None:
     """Its arguments."""
     parser.add_argument(
-        "task", nargs="?", help="one of `star envs`, or MODULE:NAME; with --run its own task, or one of its world"
+        "task",
+        nargs="?",
+        help="one of `star envs`, MODULE:NAME, or a run; with --run its own task, or one of its world",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=".png, .jpg, .mp4, .gif or .html")
     parser.add_argument(
@@ -59,6 +61,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     """Draw what the experiment of the run draws, or a task of STAR."""
+    if options.run is None and options.task and Path(options.task, "config.yaml").is_file():
+        options.run, options.task = Path(options.task), None
     options.run = options.run and agents.find(options.run)
     kind = runs.kind_of([options.run], "render") if options.run else kinds.find(_experiment(options.task))
     if "render" not in kind.commands:

@@ -108,6 +108,7 @@ def _newest(run_dir: Path) -> int | None:
 
 def _draw(run_dir: Path) -> str:
     """Draw a film of the newest checkpoint; returns what went wrong, if anything did."""
+    (run_dir / "figures").mkdir(exist_ok=True)
     words = ["render", "--run", str(run_dir), "--out", str(run_dir / "figures" / FILM), "--force", "--quiet"]
     command = ["nice", "-n", "5", sys.executable, "-m", "star", *words, *page.SMALL_FILM]
     done = subprocess.run(command, env=os.environ | {"JAX_PLATFORMS": "cpu"}, capture_output=True, text=True)

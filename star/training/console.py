@@ -106,6 +106,8 @@ class Display:
     def __enter__(self) -> Self:
         if self._shown:
             self._live.start()
+        elif not self._quiet:
+            self.say("compiling; then a line for each evaluation")
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -128,6 +128,19 @@ def test_it_plays_in_a_gymnasium_loop_and_says_when_reset_was_forgotten(agent):
     np.testing.assert_array_equal(agent.act(flat.astype(np.float64)), both)
 
 
+def test_its_environment_is_the_task_of_its_run_with_test_goals(run, agent):
+    env, trained = agent.env(), agent.env(goals="train", episode_length=7)
+    maze = programs.build(load_to_act(run, {})).experiment.test_env
+    assert env.maze.episode_length == maze.episode_length == STEPS and trained.maze.episode_length == 7
+    np.testing.assert_array_equal(env.maze.walls, maze.walls)
+    goals = [{tuple(one.reset(seed=seed)[0]["desired_goal"]) for seed in range(3)} for one in (env, trained)]
+    assert [len(each) for each in goals] == [1, 3]
+    obs, info = env.reset(seed=0)
+    assert not info["is_success"] and env.action_space.contains(agent.act(obs))
+    with pytest.raises(UserError, match='^option "gaols" .* did you mean "goals"'):
+        agent.env(gaols="train")
+
+
 @pytest.mark.parametrize(
     ("obs", "said"),
     [

@@ -176,7 +176,8 @@ def test_a_picture_of_a_task_shows_its_start_and_a_test_goal(name, words, moment
     assert len(goals) == moments and (goals.tolist() == [[0.0, 16.0]] * moments) == on_test_goal
 
 
-def test_the_command_draws_an_agent(can_draw, run, recorded, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("given", ["--run RUN", "RUN"])
+def test_the_command_draws_an_agent(given, can_draw, run, recorded, tmp_path, monkeypatch, capsys):
     asked = []
 
     def record(config, run_dir, **how):
@@ -185,7 +186,8 @@ def test_the_command_draws_an_agent(can_draw, run, recorded, tmp_path, monkeypat
 
     monkeypatch.setattr(films, "record_run", record)
     out = tmp_path / "agent.gif"
-    arguments = f"render --run {run} --out {out} --seed 6 --checkpoint 160 --evaluation-seed 9 --envs 2 --every 10"
+    arguments = f"render {given} --out {out} --seed 6 --checkpoint 160 --evaluation-seed 9 --envs 2 --every 10"
+    arguments = arguments.replace("RUN", str(run))
     assert cli.main([*arguments.split(), "--height", "60"]) == 0
     how = {"checkpoint": "160", "agent": 6, "envs": 2, "steps": None, "exam": Exam(seed=9), "number": None}
     assert asked == [("point_maze", run, how)]

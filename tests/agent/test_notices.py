@@ -18,14 +18,14 @@ def rows(*, ground, success=0.0, full=0, count=30):
 def test_a_full_table_is_told_with_its_size_and_since_when():
     found = notices(rows(ground=lambda i: 0.1 * i, full=7))
     assert set(found) == {"room"}
-    assert "24 since 8,000 env steps" in found["room"] and "abstraction.max_regions" in found["room"]
+    assert "24 since env step 8,000" in found["room"] and "abstraction.max_regions" in found["room"]
 
 
 @pytest.mark.parametrize(("success", "told"), [(0.0, True), (0.49, True), (0.5, False), (1.0, False)])
 def test_a_frontier_that_stands_still_is_told_of_agents_that_do_not_succeed(success, told):
     found = notices(rows(ground=lambda i: min(i, 5) / 10, success=success))
     assert ("frontier" in found) == told
-    assert not told or "since 6,000 env steps" in found["frontier"]
+    assert not told or "since env step 6,000" in found["frontier"]
 
 
 def test_a_frontier_that_moves_or_has_stood_for_a_short_time_is_not_told():
@@ -35,7 +35,7 @@ def test_a_frontier_that_moves_or_has_stood_for_a_short_time_is_not_told():
 
 
 def test_luck_is_no_new_ground():
-    assert "since 6,000" in notices(rows(ground=lambda i: min(i, 5) / 10 + 0.001 * (i % 7)))["frontier"]
+    assert "since env step 6,000" in notices(rows(ground=lambda i: min(i, 5) / 10 + 0.001 * (i % 7)))["frontier"]
 
 
 def test_runs_that_are_older_than_the_metric_say_nothing_of_it():

@@ -100,6 +100,27 @@ def test_a_dry_run_says_how_often_a_level_learns_from_what_is_new(folder, capsys
     assert "controller: " not in out
 
 
+def test_a_dry_run_says_where_the_goal_of_a_map_is_that_marks_none(folder, capsys):
+    (folder / "run.yaml").write_text(json.dumps(RUN))
+    for goal, told in (("0", True), ("g", False)):
+        (folder / "map.txt").write_text(f"11111\n1{goal}011\n11r01\n11111\n")
+        assert (
+            main(
+                [
+                    "train",
+                    "run.yaml",
+                    "--dry-run",
+                    *"--env.options.map map.txt --env.options.cell 2 --abstraction.cuts null".split(),
+                ]
+            )
+            == 0
+        )
+        note = (
+            '# env.options.map: no cell is "g"; the goal of tests is at x -2 m, y 2 m from the start, the longest walk'
+        )
+        assert (f"{note}\n" in capsys.readouterr().out) == told
+
+
 def test_a_sink_of_the_command_line_joins_those_of_the_config(folder, capsys):
     pytest.importorskip("wandb")
     (folder / "run.yaml").write_text(json.dumps(RUN | {"trainer": RUN["trainer"] | {"sinks": ["tensorboard"]}}))

@@ -123,7 +123,7 @@ def test_each_checkpoint_is_drawn_once_and_what_goes_wrong_is_said_once(make, mo
     def draw(words, **_):
         options = command.parsers()[1]["render"].parse_args(words[words.index("render") + 1 :])
         drawn.append(options.run)
-        assert options.out == run_dir / "figures" / watching.FILM
+        assert options.out == run_dir / "figures" / watching.FILM and options.out.parent.is_dir()  # before the run ends
         return SimpleNamespace(returncode=2 * (len(drawn) > 1), stderr="note: x\nerror: pictures need OpenGL\n")
 
     monkeypatch.setattr(watching.subprocess, "run", draw)

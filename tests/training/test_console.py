@@ -114,7 +114,7 @@ def test_a_part_that_ends_in_an_error_leaves_the_stopwatch_as_it_was(now, stopwa
 def test_the_view_shows_what_a_run_is_doing():
     view = last_view(terminal(), ROW | SGIM | FAULTY)
     for text in (
-        "training", "50%", "1:15 left", "50 of 100, 45,210/s", "0.75 ▇", "0.50 ▅", "success any", "14, 3 edges",
+        "training", "50%", "1:15 left", "50 of 100, 45,210/s", "0.75 ▇", "0.50 ▅", "success any", "14, 3 pairs reach",
         "autonomous 0.75  guide 0.25", "simulator faults  5", "GiB", "-0.02", "0.125", "0.0625",
     ):  # fmt: skip
         assert text in view
@@ -152,9 +152,10 @@ def test_an_interrupted_run_says_that_it_stops():
 
 
 def test_without_a_terminal_there_is_one_plain_line_for_each_evaluation():
-    facts = "success_final 0.50  success_any 0.75  regions 14, 3 edges"
-    assert plain(ROW) == f"50 / 100 env steps  45,210 env steps/s  {facts}  5 s left\n"
-    assert plain({"env_steps_per_s": 1}) == ""
+    facts = "success_final 0.50  success_any 0.75  regions 14, 3 pairs reach"
+    begins = "compiling; then a line for each evaluation\n"
+    assert plain(ROW) == f"{begins}50 / 100 env steps  45,210 env steps/s  {facts}  5 s left\n"
+    assert plain({"env_steps_per_s": 1}) == begins
     assert "left" not in plain(ROW, left_s=None)
 
 
