@@ -26,6 +26,7 @@ DPI = 100
 FLOOR, VOID, INK, REGION = "0.95", "0.3", "0.15", "0.6"
 BODY = (0.85, 0.55, 0.25)
 SMALL = 300  # pixels of height below which ticks and legend are left out
+LEGEND_ROW = 17  # pixels
 
 
 class Sheet:
@@ -40,7 +41,7 @@ class Sheet:
         tells whether there will be subgoals and target regions.
         """
         small = height < SMALL
-        left, right, bottom, top = (4, 4, 4, 0) if small else (42, 12, 46, 4)
+        left, right, bottom, top = (4, 4, 4, 0) if small else (42, 12, 46 + LEGEND_ROW * subgoals, 4)
         inner = round(render.aspect_of(stage.env.arena) * (height - bottom - top)), height - bottom - top
         self._stage = stage
         self._head = max(16, height // 15)
@@ -58,7 +59,10 @@ class Sheet:
         self._add_movers(axes, scale=min(1.0, height / 400))
         if not small:
             font = 72 / DPI * min(11.0, inner[0] / 28)
-            _add_legend(figure, (corner[0] + inner[0] / 2) / self.width, font=font, subgoals=subgoals)
+            rows = _legend_rows(stage.env.success_radius, regions=regions is not None, subgoals=subgoals)
+            for number, row in enumerate(rows):
+                below = LEGEND_ROW * (len(rows) - 1 - number) / self.height
+                _add_legend(figure, row, ((corner[0] + inner[0] / 2) / self.width, below), font=font)
         self._moving: list[Artist] = [
             self._target, self._reach, *self._gates, *self._blocks, self._trail, self._start, self._goal, self._subgoal,
             self._body, self._left, self._right,
@@ -172,18 +176,34 @@ def tiled(pictures: list[np.ndarray], columns: int) -> np.ndarray:
     return sheet
 
 
-def _add_legend(figure: Figure, centre: float, *, font: float, subgoals: bool) -> None:
-    def point(symbol: str, colour: Any, size: float, label: str) -> Line2D:
-        return Line2D([], [], marker=symbol, color=colour, linestyle="none", markersize=size, label=label)
+def _legend_rows(radius: float, *, regions: bool, subgoals: bool) -> list[list[Line2D | Patch]]:
+    """Handles of what is on each map, and of what an agent aims at; `radius` is that of success, in m."""
 
-    handles: list[Line2D | Patch] = [Line2D([], [], color=TRAIL, label="way"), point("*", GOAL, 9, "goal")]
-    if subgoals:
-        handles.append(point("D", SUBGOAL, 5, "subgoal"))
-        handles.append(Patch(facecolor=(*TARGET, 0.2), edgecolor=TARGET, label="target region"))
+    def point(symbol: str, colour: Any, size: float, label: str, **style: Any) -> Line2D:
+        return Line2D([], [], marker=symbol, color=colour, linestyle="none", markersize=size, label=label, **style)
+
+    task: list[Line2D | Patch] = [
+        Line2D([], [], color=TRAIL, label="way"),
+        point("*", GOAL, 9, "goal"),
+        point("o", GOAL, 9, f"success: within {radius:g} m", markerfacecolor=(*GOAL, 0.2)),
+        Patch(facecolor=scene.WALL_COLOUR, label="wall"),
+    ]
+    if not subgoals:
+        return [task]
+    aims: list[Line2D | Patch] = [
+        point("D", SUBGOAL, 5, "subgoal"),
+        Patch(facecolor=(*TARGET, 0.2), edgecolor=TARGET, label="target: region or goal's box"),
+    ]
+    if regions:
+        aims.append(Patch(facecolor="none", edgecolor=REGION, label="region"))
+    return [task, aims]
+
+
+def _add_legend(figure: Figure, handles: list[Line2D | Patch], middle: tuple[float, float], *, font: float) -> None:
     figure.legend(
         handles=handles,
         loc="lower center",
-        bbox_to_anchor=(centre, 0.0),
+        bbox_to_anchor=middle,
         ncols=len(handles),
         fontsize=font,
         labelcolor=INK,

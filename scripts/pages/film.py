@@ -14,8 +14,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import jax
-import numpy as np
 from PIL import Image
 
 from envs import video
@@ -27,19 +25,7 @@ from star.config import agents
 from star.config.loading import load_to_act
 
 FILM = charts.IMAGES / "film.gif"
-AFTER = 30  # env steps at the goal, at the end of the film
 DEFAULTS = ("ant_maze", "point_maze")
-
-
-def until_arrived(recording: films.Recording) -> films.Recording:
-    """The recording of one environment up to `AFTER` env steps at the goal; raises `UserError` if it does not stay."""
-    success = recording.moments.success[:, 0] > 0
-    end = int(np.argmax(success)) + AFTER if success.any() else 0
-    if not success.any() or end >= len(success) or not success[end]:
-        raise UserError("the episode does not end within the goal; choose another agent or --evaluation-seed")
-    return films.Recording(
-        recording.env, jax.tree.map(lambda leaf: leaf[: end + 1], recording.moments), recording.regions
-    )
 
 
 def ending(path: Path = FILM) -> dict[str, Any]:
@@ -51,12 +37,14 @@ def ending(path: Path = FILM) -> dict[str, Any]:
 def make(agent: str, out: Path, *, seed: int, every: int, height: int) -> dict[str, Any]:
     """Record, draw and write the film; returns its `ending`."""
     run = agents.find(Path(agent))
-    recording = until_arrived(
+    recording = films.until_settled(
         films.record_run(
             load_to_act(run, {}), run, checkpoint="last", agent=None, envs=1, steps=None, exam=Exam(seed=seed)
         )
     )
     moments = recording.moments
+    if not moments.success[-1, 0]:
+        raise UserError("the episode does not end within the goal; choose another agent or --evaluation-seed")
     show = films.Show(out, every=every, height=height, camera="follow")
     times = video.moments(out, len(moments.obs), every=every)
     pictures = [Image.fromarray(one) for one in films.draw(recording, show, times)]

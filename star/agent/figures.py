@@ -18,6 +18,8 @@ from star.training.figures import draw_measures
 
 _MAX_PANELS = 5
 _GROWTH_PANELS = 4
+OUTLINE = "tab:purple"  # of regions without a value
+WALL = (0.25, 0.25, 0.25, 0.75)
 
 Row = Mapping[str, Any]
 
@@ -82,13 +84,18 @@ def sgim_figure(*, regions: Sequence[Row], rows: Sequence[Row], walls: np.ndarra
     return figure
 
 
-def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str = "chosen") -> None:
-    """The first two abstract dimensions of the regions of a row, coloured `by` one of its values, over the walls."""
-    lower, upper, chosen = flat(row["lower"]), flat(row["upper"], height=1.0), np.asarray(row[by], float)
+def draw_regions(axis: Axes, row: Row, walls: np.ndarray, *, by: str | None = "chosen") -> None:
+    """The first two abstract dimensions of the regions of a row, under the walls.
+
+    They are coloured `by` one of the row's values, or with None outlined in `OUTLINE`.
+    """
+    lower, upper = flat(row["lower"]), flat(row["upper"], height=1.0)
+    chosen = np.zeros(len(lower)) if by is None else np.asarray(row[by], float)
     colours = ScalarMappable(norm=Normalize(0, max(float(chosen.max()), 1e-9)), cmap="viridis").to_rgba(chosen)
     for low, high, colour in zip(lower, upper, colours, strict=True):
         width, height = (high - low)[:2]
-        axis.add_patch(Rectangle(low[:2], width, height, facecolor=colour, edgecolor="white", linewidth=1.0))
+        look = {"fill": False, "edgecolor": OUTLINE} if by is None else {"facecolor": colour, "edgecolor": "white"}
+        axis.add_patch(Rectangle(low[:2], width, height, linewidth=1.0, **look))
     draw_walls(axis, walls)
     frame(axis, lower, upper)
 
@@ -102,9 +109,7 @@ def frame(axis: Axes, lower: np.ndarray, upper: np.ndarray) -> None:
 def draw_walls(axis: Axes, walls: np.ndarray) -> None:
     """Rectangles [n, 4] (x_low, y_low, x_high, y_high)."""
     for x_low, y_low, x_high, y_high in walls:
-        axis.add_patch(
-            Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, facecolor="0.25", alpha=0.75, linewidth=0)
-        )
+        axis.add_patch(Rectangle((x_low, y_low), x_high - x_low, y_high - y_low, facecolor=WALL, linewidth=0))
 
 
 def _draw_panels(axes: Sequence[Axes], panels: Sequence[tuple[Row, str]], walls: np.ndarray) -> None:

@@ -1,6 +1,7 @@
 """Pictures of episodes: of a trained agent, or of random actions.
 
 record    an episode of N environments in one compiled program: where everything is before every env step
+settle    of a film, leave out the part in which all stand at their goals
 draw      on the host, the wanted ones of these moments
 write     .png, .jpg, .mp4, .gif or .html
 """
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +39,14 @@ MAX_ENVS = 25
 HEIGHTS = ((1, 480), (4, 320), (9, 240), (MAX_ENVS, 180))  # pixels of a tile, by the number of environments
 _TEST = Exam()
 WIDE = 16 / 9  # the shape that several tiles together come near to
+REST = 2.0  # s that a film goes on after the last arrival
 
 
 @dataclass(frozen=True)
 class Show:
     """The picture to draw: `envs` environments for `steps` env steps, every `every`th of them.
 
-    `steps` None is the episode, but in a still without an agent 0.
+    `steps` None is the episode, but in a still without an agent 0; a film then ends early where `until_settled` says.
     `camera` None is `overview` in a still and `follow` in a film; `height` None goes by the number of environments.
     """
 
@@ -120,6 +122,8 @@ def render(
                 exam=exam,
                 number=episode,
             )
+        if show.steps is None and not video.is_still(show.out):
+            recording = until_settled(recording)
         times = video.moments(show.out, len(recording.moments.obs), every=show.every)
         progress.update(task, description="drawing", total=len(times), since=None)
         pictures = _ticking(draw(recording, show, times), progress, task)
@@ -202,6 +206,17 @@ def record_run(
     abstraction = jax.device_get(of_one(states.abstraction, index))
     regions = abstraction.lower[: abstraction.count], abstraction.upper[: abstraction.count]
     return Recording(env, moments, regions if config.commander.enabled else None)
+
+
+def until_settled(recording: Recording) -> Recording:
+    """The recording until `REST` after all environments are at their goals to stay; the whole one if any is not."""
+    success = recording.moments.success > 0
+    if not success[-1].all():
+        return recording
+    away = np.flatnonzero(~success.all(axis=1))
+    arrival = away[-1] + 1 if len(away) else 0
+    end = arrival + round(REST / recording.env.dt) + 1
+    return replace(recording, moments=jax.tree.map(lambda leaf: leaf[:end], recording.moments))
 
 
 def draw(recording: Recording, show: Show, times: list[int]) -> Iterator[np.ndarray]:

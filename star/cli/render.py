@@ -47,7 +47,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--episodes", dest="trainer.eval_episodes", metavar="N", help="that evaluation's --episodes")
     add_goals(parser)
     parser.add_argument(
-        "--steps", type=natural, metavar="N", help="env steps (default: the whole episode; 0 in a picture of a task)"
+        "--steps",
+        type=natural,
+        metavar="N",
+        help="env steps (default: the episode, in a film until 2 s after arrival; 0 in a picture of a task)",
     )
     parser.add_argument("--every", type=count(), default=2, metavar="N", help="draw every Nth env step (default: 2)")
     parser.add_argument("--fps", type=count(50), default=20, metavar="N", help="pictures a second (default: 20)")

@@ -109,6 +109,47 @@ def test_after_its_end_an_environment_stays_as_it_was():
     np.testing.assert_array_equal(joined.qpos[:, 1, 0], [1, 3, 5, 5, 5, 5])
 
 
+def arriving(*success):
+    """A recording of environments that are at their goals at the moments with a 1, half a second apart."""
+    success = np.array(success, float).T
+    leaves = {name: np.zeros_like(success) for name in ("qpos", "mocap_pos", "obs", "distance", "done")}
+    return films.Recording(SimpleNamespace(dt=0.5), Moments(success=success, **leaves))
+
+
+@pytest.mark.parametrize(
+    ("success", "moments"),
+    [
+        ([[0, 0, 1, 1, 1, 1, 1, 1, 1, 1]], 7),  # 2 s after the arrival
+        ([[0, 1, 1, 0, 1, 1, 1, 1, 1, 1]], 9),  # it had left again
+        ([[0, 0, 0, 0, 0, 0, 0, 1, 1, 1]], 10),  # it arrives near the end
+        ([[0, 0, 1, 1, 1, 1, 1, 1, 1, 0]], 10),  # it does not stay
+        ([[0] * 10], 10),
+        ([[1] * 10], 5),
+        ([[0, 1, 1, 1, 1, 1, 1, 1, 1, 1], [0, 0, 0, 0, 1, 1, 1, 1, 1, 1]], 9),  # both have come
+        ([[0, 1, 1, 1, 1, 1, 1, 1, 1, 1], [0] * 10], 10),
+    ],
+)
+def test_a_film_ends_two_seconds_after_all_have_come_to_their_goals_to_stay(success, moments):
+    recording = arriving(*success)
+    settled = films.until_settled(recording).moments
+    assert len(settled.success) == len(settled.obs) == moments
+    np.testing.assert_array_equal(settled.success, recording.moments.success[:moments])
+
+
+@pytest.mark.parametrize(
+    ("name", "steps", "moments"), [("a.gif", None, 6), ("a.gif", 9, 10), ("a.png", None, 10), ("a.png", 9, 10)]
+)
+def test_stills_and_films_of_so_many_env_steps_do_not_end_early(name, steps, moments, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(films, "record_run", lambda *_, **__: arriving([0, *[1] * 9]))
+    monkeypatch.setattr(films, "draw", lambda recording, show, times: seen.append((recording, times)) or iter([]))
+    monkeypatch.setattr(films.video, "write", lambda out, pictures, fps: len(list(pictures)))
+    show = Show(out=tmp_path / name, steps=steps, every=1)
+    assert films.render(parse({}), show, run_dir=tmp_path, quiet=True).endswith("; the goal is reached")
+    ((recording, times),) = seen
+    assert len(recording.moments.obs) == moments and times[-1] == moments - 1
+
+
 @pytest.mark.parametrize(
     ("out", "every", "total", "shown"),
     [

@@ -5,7 +5,7 @@ import pytest
 import envs
 from envs import render, scene
 from envs.render import GOAL, SUBGOAL, Marks, Stage
-from envs.topdown import BODY, VOID, Sheet, tiled
+from envs.topdown import BODY, SMALL, VOID, Sheet, tiled
 
 HEIGHT = 400
 
@@ -30,10 +30,9 @@ def near(sheet, colour, tolerance=3):
 def colour_at(stage, sheet, x, y):
     """The colour of a place on the map, whose outline is that of the walls around it."""
     rows, columns = np.nonzero(near(sheet, scene.WALL_COLOUR))
-    x_lo, y_lo, x_hi, y_hi = render.frame_of(stage.env.arena)
-    column = columns.min() + (x - x_lo) / (x_hi - x_lo) * (columns.max() + 1 - columns.min())
-    row = rows.min() + (y_hi - y) / (y_hi - y_lo) * (rows.max() + 1 - rows.min())
-    return sheet[int(row), int(column)].astype(int)
+    x_lo, _, x_hi, y_hi = render.frame_of(stage.env.arena)
+    scale = (columns.max() + 1 - columns.min()) / (x_hi - x_lo)  # below the map the legend has a wall, too
+    return sheet[int(rows.min() + (y_hi - y) * scale), int(columns.min() + (x - x_lo) * scale)].astype(int)
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +90,24 @@ def test_a_sheet_shows_only_what_it_was_last_told(maze):
     assert (sheet.draw(Marks(goal=np.array([0.0, 16.0])), left="c", right="d") != first).any()
     at(stage, 0.0, 0.0)
     assert (sheet.draw(Marks(), left="a", right="b") == first).all()
+
+
+@pytest.mark.parametrize("name", ["point_maze", "point_hardest_maze", "ant_fall"])
+@pytest.mark.parametrize("height", [SMALL, 480, 1080])
+def test_the_legend_names_all_marks_and_is_no_wider_than_the_map_and_its_margins(name, height):
+    stage, *_ = staged(name)
+    corners = np.zeros((1, len(stage.env.abstract_indices)))
+    for subgoals in (False, True):
+        sheet = Sheet(stage, height=height, view_width=100, regions=(corners, corners + 1), subgoals=subgoals)
+        figure = sheet._canvas.figure
+        labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+        radius = f"success: within {stage.env.success_radius:g} m"
+        aims = ["subgoal", "target: region or goal's box", "region"]
+        assert labels == ["way", "goal", radius, "wall"] + aims * subgoals
+        lowest = figure.axes[0].get_tightbbox().y0
+        for legend in figure.legends:
+            box = legend.get_window_extent()
+            assert 100 <= box.x0 and box.x1 <= sheet.width and 0 <= box.y0 and box.y1 <= lowest
 
 
 def test_text_and_the_picture_of_the_camera_have_their_places(maze):
