@@ -629,7 +629,8 @@ function watch() {
   }
   history.scrollRestoration = "manual";
   document.documentElement.style.overflowAnchor = "none";
-  setTimeout(() => scrollTo(0, sessionStorage.getItem("scroll") || 0), 100);  // once all charts have their height
+  const place = sessionStorage.getItem("scroll");
+  if (place !== null) setTimeout(() => scrollTo(0, place), 100);  // once all charts have their height
   const changes = new EventSource(`changes?of=${watched}`);
   changes.onmessage = () => {
     changes.close();

@@ -37,7 +37,7 @@ FILM = "latest.html"
 _HOST = "127.0.0.1"
 _NAMES = {_HOST, "localhost"}  # what a browser may call it: another name is a page of somebody else's that asks
 _LOOK_S = 0.5
-_LAST_S = 5.0  # how long open pages have to load the run's last state
+_LAST_S = 30.0  # how long open pages have at most to load the run's last state
 _WAITING = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><title>{name} · STAR</title>
 <link rel="icon" href="data:,"></head>
@@ -53,6 +53,10 @@ class Watched:
     def __init__(self, run_dir: Path, config: RunConfig) -> None:
         self._path, self._config = run_dir, config
         self.ended = threading.Event()
+        self.waiting: set[object] = set()
+        """Pages that are open, and wait for something else to show."""
+        self.shown = 0
+        """Pages that have loaded the last state."""
 
     def version(self) -> str:
         """Another text whenever the page would show something else."""
@@ -95,8 +99,12 @@ def serve(run_dir: Path, config: RunConfig, *, port: int, films: bool, say: Call
                     told.add(fault)
                     say(f"no film of {newest} {kinds.of(config).unit}: {fault}")
             time.sleep(_LOOK_S)
+        pages = len(watched.waiting)
         watched.ended.set()
-        time.sleep(_LAST_S)
+        end = time.monotonic() + _LAST_S
+        time.sleep(2 * _LOOK_S)  # for a page that has just been loaded, and does not wait yet
+        while watched.shown < pages and time.monotonic() < end:
+            time.sleep(_LOOK_S)
         server.shutdown()
 
 
@@ -125,7 +133,10 @@ def _server(watched: Watched, port: int) -> ThreadingHTTPServer:
                 return self.send_error(HTTPStatus.FORBIDDEN)
             with contextlib.suppress(ConnectionError):  # the browser has closed the page
                 if asked.path == "/":
-                    return self._answer("text/html; charset=utf-8", _page(watched))
+                    last = watched.ended.is_set()
+                    self._answer("text/html; charset=utf-8", _page(watched))
+                    watched.shown += last
+                    return None
                 if asked.path == "/changes":
                     return self._changes(parse_qs(asked.query).get("of", [""])[0])
                 self.send_error(HTTPStatus.NOT_FOUND)
@@ -134,10 +145,14 @@ def _server(watched: Watched, port: int) -> ThreadingHTTPServer:
         def _changes(self, version: str) -> None:
             """Tell once that the page of `version` is out of date."""
             self._answer("text/event-stream", "")
-            while watched.version() == version:
-                time.sleep(_LOOK_S)
-                self.wfile.write(b":\n\n")  # notices that nobody listens any more
-            self.wfile.write(b"data: changed\n\n")
+            watched.waiting.add(self)
+            try:
+                while watched.version() == version:
+                    time.sleep(_LOOK_S)
+                    self.wfile.write(b":\n\n")  # notices that nobody listens any more
+                self.wfile.write(b"data: changed\n\n")
+            finally:
+                watched.waiting.discard(self)
 
         def _answer(self, kind: str, text: str) -> None:
             self.send_response(HTTPStatus.OK)

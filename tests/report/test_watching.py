@@ -136,7 +136,7 @@ def test_each_checkpoint_is_drawn_once_and_what_goes_wrong_is_said_once(make, mo
 
 
 def test_in_a_browser_it_renews_itself_and_keeps_what_was_chosen(browser, make, monkeypatch):
-    monkeypatch.setattr(watching, "_LAST_S", 5.0)
+    monkeypatch.setattr(watching, "_LAST_S", 60.0)  # it ends once the page has loaded the last state
     run_dir = make(rows=[])
     row = "document.querySelector('table.runs').textContent"
     with served(run_dir) as page:
@@ -160,7 +160,7 @@ def test_in_a_browser_it_renews_itself_and_keeps_what_was_chosen(browser, make, 
 
 
 def until(browser, condition):
-    end = time.monotonic() + 20
+    end = time.monotonic() + 60
     while not browser.run(condition):
         assert time.monotonic() < end, condition
         time.sleep(0.1)
