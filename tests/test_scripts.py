@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import random
+import re
 import shutil
 import subprocess
 import sys
@@ -34,6 +35,26 @@ from star.training import program as programs
 from star.training.checkpoint import Checkpoints, Damaged
 from star.training.journal import JsonLines
 from tests.scripts import load
+
+
+def test_the_periods_of_an_agent_are_told_with_the_regions_that_hold_its_places(run, capsys):
+    script = load("checks/periods")
+    script.main([str(run), "--seed", "6", "--episodes", "3", "--commands", "2"])
+    head, goal, *lines = capsys.readouterr().out.splitlines()
+    assert head == "seed 6, 160 env steps, 4 regions; the agent does not arrive"
+    numbers = lambda text: [float(x) for x in re.findall(r"-?\d+\.\d", text)]  # noqa: E731
+    x, y, *corners = numbers(goal)
+    assert corners[0] <= x <= corners[2] and corners[1] <= y <= corners[3]
+    steps, (told, *commands) = lines[:2], lines[2:]
+    assert [int(line.split()[0]) for line in steps] == [0, 20]
+    assert max(map(abs, numbers(steps[0])[:2])) < 0.3  # the start
+    assert all(line.count("(") == 3 for line in steps)  # the place, and a subgoal every ten env steps
+    low_x, low_y, high_x, high_y = numbers(told)
+    assert low_x <= 0.0 <= high_x and low_y <= 0.0 <= high_y and "2 periods began here" in told
+    assert len(commands) == 2 and all("number" in line for line in commands)
+    with pytest.raises(SystemExit, match="2"):
+        script.main([str(run), "--seed", "9"])
+    assert capsys.readouterr().err == f"error: --seed: 9 is not among those of {run}: 5, 6\n"
 
 
 def test_the_check_of_the_physics_passes_and_notices_another_model(monkeypatch):
