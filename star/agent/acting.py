@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from envs.common import files, plugins
 from envs.common.errors import UserError
-from star.agent import commands, hierarchy, levels
+from star.agent import commands, environment, hierarchy, levels
 from star.agent.decisions import Memory, Roadmap
 from star.agent.sections import AgentConfig, Config
 from star.agent.state import TrainState
@@ -156,7 +156,9 @@ class TrainedAgent:
             raise UserError(f"env: {section.name} is an environment of your own: make it, and give its obs to act")
         from envs.gym import GymEnv  # it imports what acting alone does not need
 
-        return GymEnv(section.name, **{"engine": section.engine, "goals": "test"} | section.options | options)
+        return GymEnv(
+            section.name, **{"engine": section.engine} | environment.options_of(self.config, "test") | options
+        )
 
     def render(self, path: str | Path, *, force: bool = False, **how: Any) -> str:
         """Write a picture or a film of a test episode, and return a line about it; the ending of `path` decides.

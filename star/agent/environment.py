@@ -25,18 +25,21 @@ def make(config: Config, goals: str, **others: Any) -> Any:
     Raises:
       UserError: in one line, if it cannot be had.
     """
-    training = {"goals": "train"} | config.env.options | config.env.training
-    if goals == "train":
-        options = training | others
-    else:
-        options = config.env.options | {"goals": training["goals"] if goals == "trained" else goals} | others
-    name, engine = config.env.name, config.env.engine
+    name, engine, options = config.env.name, config.env.engine, options_of(config, goals) | others
     try:
         if not plugins.is_plugin(name):
             return envs.make(name, engine=engine, **options)
         return goal_env.adapt(_made(name, engine, options), name=name)
     except envs.UserError as error:
         raise ConfigError(f"env: {error}") from None
+
+
+def options_of(config: Config, goals: str) -> dict[str, Any]:
+    """The options of the task of `config`, for `goals` as in `make`."""
+    training = {"goals": "train"} | config.env.options | config.env.training
+    if goals == "train":
+        return training
+    return config.env.options | {"goals": training["goals"] if goals == "trained" else goals}
 
 
 def engine_of(config: Config, env: Any) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from envs import arena, goal_env
-from envs.common import modes
+from envs.common import modes, plugins
 from envs.options import normal
 from envs.vector import VectorEnv
 from star import devices, learners
@@ -118,7 +118,9 @@ class Star(Experiment):
         """A user's map that marks no goal, and levels that learn from old transitions: how often from each."""
         said = [(name, level.settings.samples_per_transition(size)) for name, level, size in self.config.learners()]
         notes = [f"{name}: {samples:.3g} samples per new transition" for name, samples in said if samples is not None]
-        if "map" in self.config.env.options and not any(self.test_env.arena.cells(arena.GOAL)):
+        section = self.config.env
+        ours = "map" in section.options and not plugins.is_plugin(section.name)
+        if ours and not any(self.test_env.arena.cells(arena.GOAL)):
             x, y = self.goal[:2]
             where = f"x {x:g} m, y {y:g} m from the start, the longest walk"
             notes.append(f'env.options.map: no cell is "{arena.GOAL}"; the goal of tests is at {where}')

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from envs.common.errors import UserError
 from star import cli
 from star.agent import play
 from star.agent.slim import slim
-from star.config.loading import load_to_act
+from star.config.loading import load_to_act, parse
 from star.training import checkpoint
 from star.training import program as programs
 from tests.small import ALONE, RUN
@@ -128,7 +129,7 @@ def test_it_plays_in_a_gymnasium_loop_and_says_when_reset_was_forgotten(agent):
     np.testing.assert_array_equal(agent.act(flat.astype(np.float64)), both)
 
 
-def test_its_environment_is_the_task_of_its_run_with_test_goals(run, agent):
+def test_its_environment_is_the_task_of_its_run_with_test_goals(run, agent, monkeypatch):
     env, trained = agent.env(), agent.env(goals="train", episode_length=7)
     maze = programs.build(load_to_act(run, {})).experiment.test_env
     assert env.maze.episode_length == maze.episode_length == STEPS and trained.maze.episode_length == 7
@@ -137,6 +138,10 @@ def test_its_environment_is_the_task_of_its_run_with_test_goals(run, agent):
     assert [len(each) for each in goals] == [1, 3]
     obs, info = env.reset(seed=0)
     assert not info["is_success"] and env.action_space.contains(agent.act(obs))
+    config = parse(agent.config.model_dump(mode="json"), {"env.options.goals": "train", "env.options.cell": 6})
+    monkeypatch.setattr(agent, "_program", replace(agent._program, config=config))  # an option of its run
+    told = [tuple(agent.env().reset(seed=seed)[0]["desired_goal"]) for seed in (0, 1)]
+    assert told[0] == told[1] and agent.env().maze.arena.cell == 6
     with pytest.raises(UserError, match='^option "gaols" .* did you mean "goals"'):
         agent.env(gaols="train")
 

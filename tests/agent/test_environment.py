@@ -23,7 +23,7 @@ from tests.small import ALONE, RUN, arrays
 
 PAGE = (Path(__file__).parents[2] / "docs" / "your_robot.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r'```\w+ title="([\w.]+)"\n(.*?)```', PAGE, re.DOTALL))
-MODULES = ("room", "arm", "car")
+MODULES = ("room", "arm", "car", "mapped")
 EPOCH = 100 * RUN["trainer"]["num_envs"]
 
 
@@ -47,6 +47,13 @@ def forget(monkeypatch):
     monkeypatch.setenv("STAR_IMPORT", "")
     for module in MODULES:
         sys.modules.pop(module, None)
+
+
+def test_an_option_of_ones_own_may_be_called_map(here, capsys):
+    (here / "mapped.py").write_text("import room\n\n\ndef make(goals, map):\n    return room.make(goals)\n")
+    words = ["train", "run.yaml", "--import", "room", "--env.name", "mapped:make", "--env.options", '{"map": "a\\nb"}']
+    assert main([*words, "--dry-run"]) == 0
+    assert "env.options.map" not in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("undrawn")
