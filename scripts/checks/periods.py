@@ -24,9 +24,8 @@ import numpy as np
 from envs.common.errors import UserError
 from envs.vector import VectorEnv
 from star.abstraction import regions
-from star.agent import hierarchy, levels, play
+from star.agent import hierarchy, levels, play, values
 from star.agent.state import TrainState
-from star.agent.values import best
 from star.config.loading import load_to_act
 from star.training import checkpoint as saved
 from star.training import program as programs
@@ -72,7 +71,7 @@ class Plan:
         self.abstraction = state.abstraction
         self.count = int(state.abstraction.count)
         self.q, self.allowed = np.asarray(state.commander.q), np.asarray(roadmap.allowed.greedy)
-        self.values = np.asarray(best(state.commander.q, roadmap.allowed.greedy))
+        self.values = np.asarray(values.best(state.commander.q, roadmap.allowed.greedy))
         self.led = None if state.commander.model is None else np.asarray(state.commander.model.led)
 
     def region(self, point: np.ndarray) -> int:
@@ -109,11 +108,11 @@ def periods(told: Told, plan: Plan, *, period: int, every: int) -> tuple[list[st
 
 def commands(plan: Plan, region: int, goal_region: int, number: int) -> list[str]:
     """A line for each of the best commands of a region, for a goal in `goal_region`."""
-    possible = plan.allowed[region] | (np.arange(len(plan.allowed)) == goal_region) & (region == goal_region)
-    values = np.where(possible, plan.q[region, goal_region], -np.inf)
+    (possible,) = values.targets(plan.allowed, np.array([region]), np.array([goal_region]))
+    worth = np.where(possible, plan.q[region, goal_region], -np.inf)
     lines = []
-    for target in np.argsort(-values)[: min(number, plan.count)]:
-        line = f"  {target} {plan.box(target)}: value {values[target]:.3f}"
+    for target in np.argsort(-worth)[: min(number, plan.count)]:
+        line = f"  {target} {plan.box(target)}: value {worth[target]:.3f}"
         if plan.led is not None:
             led = plan.led[int(target == goal_region), region, target]
             ends = [

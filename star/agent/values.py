@@ -56,13 +56,13 @@ def choose(
         reach = state.q if state.model is None else state.model.reach
         values = jnp.where((practised >= 0)[:, None], reach[region, practised], values)
     pursued = goal_region if practised is None else jnp.where(practised >= 0, practised, goal_region)
-    best_values = jnp.where(_targets(allowed.greedy, region, pursued), values, -jnp.inf)
+    best_values = jnp.where(targets(allowed.greedy, region, pursued), values, -jnp.inf)
     ties = best_values >= best_values.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best_values.shape), -1.0), axis=-1)
     luck = jax.random.gumbel(random_key, best_values.shape)
     if attraction is not None:
         luck += jnp.log(jnp.maximum(attraction, 1e-6))
-    anything = jnp.where(_targets(allowed.explore, region, pursued), luck, -jnp.inf)
+    anything = jnp.where(targets(allowed.explore, region, pursued), luck, -jnp.inf)
     exploring = jax.random.uniform(explore_key, region.shape) < epsilon
     return jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
 
@@ -71,7 +71,7 @@ def towards(
     state: CommanderState, allowed: Successors, goal_region: Int[Array, ""]
 ) -> tuple[Float[Array, "R"], Int[Array, "R"]]:
     """For g* in `goal_region`: the value of every region, and the target that is best there, the first of equals."""
-    possible = _targets(allowed.greedy, jnp.arange(state.chosen.shape[0]), goal_region)
+    possible = targets(allowed.greedy, jnp.arange(state.chosen.shape[0]), goal_region)
     values = jnp.where(possible, state.q[:, goal_region], -jnp.inf)
     return best(state.q, allowed.greedy)[:, goal_region], jnp.argmax(values, axis=-1)
 
@@ -97,7 +97,7 @@ def towards_goals(batch: Decision) -> Float[Array, "N"]:
     return (1 - batch.practised) * (1 - batch.aside)
 
 
-def _targets(allowed: Bool[Array, "R R"], region: Int[Array, "n"], goal_region: Int[Array, "*n"]) -> Bool[Array, "n R"]:
+def targets(allowed: Bool[Array, "R R"], region: Int[Array, "n"], goal_region: Int[Array, "*n"]) -> Bool[Array, "n R"]:
     """Mask of the regions that may follow each `region`, if the goal is in `goal_region`."""
     home = jax.nn.one_hot(region, allowed.shape[0], dtype=bool)
     return allowed[region] | (home & (region == goal_region)[:, None])
