@@ -167,7 +167,7 @@ def test_the_commands_of_the_tutorial_work_as_they_are_but_smaller(run, tmp_path
         assert main([command, *words, *more]) == 0, capsys.readouterr().err
     steps = [json.loads(line)["env_steps"] for line in (tmp_path / "runs/mine/metrics.jsonl").read_text().splitlines()]
     assert steps == [240, 480, 720, 960]
-    assert capsys.readouterr().out.count("test goals, 95 %") == 2
+    assert capsys.readouterr().out.count("test goals, 3 episodes a seed, 95 %") == 2
     assert "runs/mine-flat" in (tmp_path / "mine.html").read_text(encoding="utf-8")
 
 

@@ -29,6 +29,8 @@ def show(rows: Sequence[Row], comparison: Mapping[str, Any] | None, *, again: Se
     """
     console = Console(width=None if sys.stdout.isatty() else _PLAIN_WIDTH, highlight=False)
     console.print(evaluations(rows))
+    for line in remarks(rows):
+        print(line)
     failing = next(((row, seed) for row in rows for seed in row["seeds"] if seed["failed"] and row["film"]), None)
     if failing:
         row, seed = failing
@@ -43,30 +45,42 @@ def show(rows: Sequence[Row], comparison: Mapping[str, Any] | None, *, again: Se
 
 def evaluations(rows: Sequence[Row]) -> Table:
     """A line for each seed of each checkpoint, and one for all seeds where there are several."""
-    table = Table(title=_title(rows), box=box.SIMPLE_HEAD)
-    about = [name for name in ("run", "env") if len({row[name] for row in rows}) > 1]
+    table = Table(title=_title(rows), box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
+    about = _telling(rows)
     for name in about:
-        table.add_column(name)
-    for name in ("env steps", "seed", "episodes"):
+        table.add_column(name, overflow="fold")
+    for name in ("env steps", "seed", *MEASURES, "s to\ngoal", "m to\ngoal", "SPL", "stayed", "end\ndistance"):
         table.add_column(name, justify="right")
-    for name in ("success_any", "success_final", "s to goal", "m to goal", "SPL", "stayed", "end distance"):
-        table.add_column(name, justify="right")
-    table.add_column("failed")
-    table.add_column("why")
-    several = any(len(row["seeds"]) > 1 for row in rows)
-    if several:
-        table.add_column(f"seeds above {ABOVE:g}")
     for row in rows:
         begin: list[Text | str] = [*(Text(row[name]) for name in about), f"{row['env_steps']:,}"]
         for seed in row["seeds"]:
-            failed = [str(number) for number in seed["failed"][:_SHOWN]]
-            more = " ..." * (len(seed["failed"]) > _SHOWN)
-            table.add_row(*begin, str(seed["seed"]), *_cells(seed), " ".join(failed) + more, _why(seed))
+            table.add_row(*begin, str(seed["seed"]), *_cells(seed))
         if len(row["seeds"]) > 1:
             over = {f"{name}_interval": row[f"{name}_seeds_interval"] for name in MEASURES}
-            learnt = "\n".join(f"{name}: {_above(row[f'{name}_above'])}" for name in MEASURES)
-            table.add_row(*begin, "all", *_cells({**row, **over}), "", _why(row), learnt)
+            table.add_row(*begin, "all", *_cells({**row, **over}))
     return table
+
+
+def remarks(rows: Sequence[Row]) -> list[str]:
+    """Lines below the table: the episodes in which each seed failed, and how many seeds have learnt the task."""
+    about = [*_telling(rows), *(["env_steps"] if len({row["env_steps"] for row in rows}) > 1 else [])]
+    lines = []
+    for row in rows:
+        words = [f"{row[name]:,} env steps" if name == "env_steps" else str(row[name]) for name in about]
+        for seed in row["seeds"]:
+            if seed["failed"]:
+                first = ", ".join(map(str, seed["failed"][:_SHOWN])) + ", ..." * (len(seed["failed"]) > _SHOWN)
+                who = ", ".join([*words, f"seed {seed['seed']}"])
+                lines.append(f"{who}: fails in episodes {first} ({_why(seed)})")
+        if len(row["seeds"]) > 1:
+            learnt = ", ".join(f"{name} {_above(row[f'{name}_above'])}" for name in MEASURES)
+            lines.append(f"{', '.join([*words, f'seeds above {ABOVE:g}'])}: {learnt}")
+    return lines
+
+
+def _telling(rows: Sequence[Row]) -> list[str]:
+    """The keys that tell the rows apart, but for their env steps."""
+    return [name for name in ("run", "env") if len({row[name] for row in rows}) > 1]
 
 
 def groups(found: Sequence[Row]) -> Table:
@@ -114,13 +128,14 @@ def _title(rows: Sequence[Row]) -> str:
     kind, _, side = rows[0]["goals"].partition(" ")
     goals = f"goals on a grid of {side} x {side}" if side else {"test": "test goals", "train": "training goals"}[kind]
     tasks = dict.fromkeys(f"{row['env']} ({row['engine']})" for row in rows)
-    return f"{', '.join(tasks)}: {goals}, 95 % intervals"
+    episodes = rows[0]["seeds"][0]["episodes"]
+    return f"{', '.join(tasks)}: {goals}, {episodes:,} episodes a seed, 95 % intervals"
 
 
 def _cells(row: Row) -> list[str]:
     success = [_interval(row[name], row[f"{name}_interval"]) for name in MEASURES]
     means = (("seconds_to_goal", ".1f"), ("path_length", ".1f"), ("spl", ".2f"), ("stayed", ".2f"), ("distance", ".2f"))
-    return [str(row["episodes"]), *success, *("-" if row[name] is None else format(row[name], f) for name, f in means)]
+    return [*success, *("-" if row[name] is None else format(row[name], f) for name, f in means)]
 
 
 def _why(row: Row) -> str:

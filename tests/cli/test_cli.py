@@ -58,6 +58,21 @@ def test_a_table_names_runs_as_they_are_called(capsys):
     assert all(name in shown for name in names) and "3 stuck, 1 out of time" in shown
 
 
+def test_a_table_of_seeds_fits_into_100_columns_and_the_rest_is_told_below(capsys):
+    row = evaluation("a", env_steps=90_000_000)
+    over = {f"{name}_seeds_interval": [0.1, 1.0] for name in ("success_any", "success_final")}
+    over |= {
+        f"{name}_above": {"seeds": 1, "of": 2, "interval": [0.01, 0.99]} for name in ("success_any", "success_final")
+    }
+    seeds = [row["seeds"][0], row["seeds"][0] | {"seed": 4, "failed": []}]
+    exam_tables.show([row | over | {"seeds": seeds}], None, again="")
+    table, _, below = capsys.readouterr().out.partition(
+        "seed 3: fails in episodes 2, 5, 6, ... (3 stuck, 1 out of time)\n"
+    )
+    assert "8 episodes a seed" in table and max(map(len, table.splitlines())) <= 100
+    assert "seed 4" not in below and "seeds above 0.9: success_any 1 of 2 [0.01, 0.99], success_final 1 of 2" in below
+
+
 def test_a_run_never_writes_over_another(capsys, folder):
     (folder / "full").mkdir()
     (folder / "full" / "thesis.txt").write_text("ten years of work")
