@@ -172,7 +172,7 @@ def test_evaluate_prints_a_line_for_each_seed_and_how_to_watch_a_failure(calls, 
         main("evaluate runs/old --episodes 7 --checkpoint best --evaluation-seed 4 --env.options.cell 4".split()) == 0
     )
     out = capsys.readouterr().out
-    assert "3 8 0.500 [0.250, 0.750] 0.500 [0.250, 0.750] 7.0 7.0 - 7.00 7.00 2 5 6 ..." in " ".join(out.split())
+    assert "3 0.500 [0.250, 0.750] 0.500 [0.250, 0.750] 7.0 7.0 - 7.00 7.00 seed 3: fails in" in " ".join(out.split())
     again = "--run runs/old --checkpoint 10 --seed 3 --episode 2 --evaluation-seed 4 --episodes 7 --env.options.cell 4"
     assert f"star render {again} --out failure.html" in out
     (call,) = calls
