@@ -28,7 +28,9 @@ class AbstractionConfig(Section):
         unit="regions",
     )
     min_width: float = setting(1.0, "No region is cut narrower than this.", unit="units of the state", gt=0)
-    min_share: float = setting(0.0, "No region is cut below this times the space over the regions left.", unit="", ge=0)
+    min_share: float = setting(
+        0.0, "No region smaller than this times the space, over the free places of the table, is cut.", unit="", ge=0
+    )
 
 
 class ForwardModelConfig(BufferedConfig):

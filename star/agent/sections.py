@@ -160,7 +160,7 @@ class ControllerConfig(LevelConfig):
     tilt_penalty: float = setting(
         0.0, "The reward of an env step loses this times 1 - cos of the body's tilt.", unit="", ge=0
     )
-    tilt_start: float = setting(1.0, "This share of tilt_penalty is taken off at first.", unit="", gt=0, le=1)
+    tilt_start: float = setting(1.0, "At first the penalty is this share of tilt_penalty.", unit="", gt=0, le=1)
     tilt_steps: float = setting(
         1e6, "The share of tilt_penalty rises exponentially to 1 over so many env steps.", unit="env steps", gt=0
     )

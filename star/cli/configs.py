@@ -12,8 +12,8 @@ from star.config.section import ConfigError
 HELP = "list the configs that come with STAR, for star train and star sweep"
 DESCRIPTION = """\
 List the config files that come with this package, by name: star train ant_maze --with agents/hiro.
-Those in folders are laid over others with --with, but for paper/, saht/ and tutoring/. star sweep takes those of
-sweeps/."""
+Those in agents/, ablations/ and sgim/, paper/many and saht/even are laid over others with --with. star sweep takes
+those of sweeps/. All others train as they are."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:

@@ -58,7 +58,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--dry-run", action="store_true", help="show settings, memory and what would be written; write nothing"
     )
-    parser.add_argument("--experiment", metavar="NAME", help="what learns: star, saht, tutoring, or MODULE:NAME")
+    parser.add_argument("--experiment", metavar="NAME", help="what learns: star, saht, tutoring, chime, or MODULE:NAME")
 
 
 def run(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
