@@ -152,7 +152,8 @@ class Adapted(Env):
             terminated=terminated.astype(jnp.float32),
         )
         done = (ended | (steps >= self.episode_length)).astype(jnp.float32)
-        return _told(wrapped, state.info, done=done, non_finite=(going & ~finite).astype(jnp.float32))
+        told = _told(wrapped, state.info, done=done, non_finite=(going & ~finite).astype(jnp.float32))
+        return told.replace(reward=jnp.where(going & finite, told.reward, 0.0))  # else nothing was done
 
     def draw_goal(self, rng: jax.Array) -> jax.Array:
         """A desired goal [k], as an episode may have."""

@@ -119,12 +119,13 @@ class Spec:
         def turn(way: Array) -> Array:
             return jnp.stack([cos * way[..., 0] + sin * way[..., 1], cos * way[..., 1] - sin * way[..., 0]], axis=-1)
 
-        velocity = np.asarray(self.velocity)
-        state = state.at[..., velocity].set(turn(state[..., velocity]))
-        state = state.at[..., np.asarray(self.orientation)].set(tilt)
-        for first in range(0, ways.shape[-1], len(self.abstract_indices)):  # also where headings begin
-            ways = ways.at[..., first : first + 2].set(turn(ways[..., first : first + 2]))
-        return state, ways
+        order = np.arange(state.shape[-1])
+        order[[*self.velocity, *self.orientation]] = state.shape[-1] + np.arange(6)
+        parts = [state, turn(state[..., np.asarray(self.velocity)]), tilt]
+        each = len(self.abstract_indices)  # also where headings begin
+        ways_one_by_one = jnp.split(ways, list(range(each, ways.shape[-1], each)), axis=-1)
+        turned = [part for way in ways_one_by_one for part in (turn(way), way[..., 2:])]
+        return jnp.concatenate(parts, axis=-1)[..., order], jnp.concatenate(turned, axis=-1)
 
     def towards(self, obs: Float[Array, "*batch obs"], point: Float[Array, "*batch d"]) -> Float[Array, "*batch p"]:
         """From the pose to that of having come straight to the abstract `point`, looking ahead."""

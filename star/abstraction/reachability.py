@@ -16,7 +16,7 @@ agents are.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -70,6 +70,19 @@ class Leaves(struct.PyTreeNode):
     used: Bool[Array, "P"]
 
 
+class Parts(NamedTuple):
+    """The parts of a box on the way to its `Leaves`, in the first `number` of P places."""
+
+    lower: Float[Array, "P d"]
+    upper: Float[Array, "P d"]
+    number: Int[Array, ""]
+    part: Int[Array, "N"]
+    """Of each start state the part that it lies in."""
+    looked: tuple[Int[Array, "P"], Int[Array, "P"], Float[Array, "P"]]
+    """Verdict of each part, and dimension and position of the plane that would halve it."""
+    visits: Float[Array, "P"]
+
+
 def from_box(lower: Float[Array, "n"], upper: Float[Array, "n"]) -> Zonotope:
     """The box [lower, upper] as a zonotope with one generator per dimension."""
     centre = (lower + upper) / 2
@@ -113,19 +126,20 @@ def relu(z: Zonotope) -> Zonotope:
 
 def hull(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) -> tuple[Array, Array]:
     """Box that contains the image of the box [lower, upper] under `network`."""
-    box = from_box(lower, upper)
-    z = network.affine(0, box)
-    for i in range(1, len(network.layers)):
-        z = network.affine(i, relu(z))
-    if network.residual:
-        z = _add_input(z, box)
-    return z.centre - z.radius, z.centre + z.radius
+    return pushed(network, lower, upper)[0]
 
 
 def smear(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) -> Float[Array, "n"]:
     """Per input: the sum over outputs of the largest |derivative| in the box, times the box's half-width there."""
-    layers = network.layers
-    z = network.affine(0, from_box(lower, upper))
+    return pushed(network, lower, upper)[1]
+
+
+def pushed(
+    network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]
+) -> tuple[tuple[Array, Array], Float[Array, "n"]]:
+    """`hull` and `smear` of the box [lower, upper], by one way through `network`."""
+    layers, box = network.layers, from_box(lower, upper)
+    z = network.affine(0, box)
     low, high = layers[0][0], layers[0][0]
     for i, (weight, _) in enumerate(layers[1:], 1):
         off = (z.centre + z.radius <= 0)[:, None]
@@ -137,7 +151,9 @@ def smear(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) 
         z = network.affine(i, relu(z))
     if network.residual:
         low, high = low + jnp.eye(low.shape[0]), high + jnp.eye(low.shape[0])
-    return jnp.maximum(jnp.abs(low), jnp.abs(high)).sum(axis=0) * (upper - lower) / 2
+        z = _add_input(z, box)
+    steepest = jnp.maximum(jnp.abs(low), jnp.abs(high)).sum(axis=0)
+    return (z.centre - z.radius, z.centre + z.radius), steepest * (upper - lower) / 2
 
 
 def shares(
@@ -187,32 +203,45 @@ def examine(
     `network` maps an abstract state [d] to the abstract state k steps after commanding `target`. A part reaches only
     if at least `min_visits` of the start states `starts` with mask `seen` lie in it. What stays undecided does not.
     """
-    judge_all = jax.vmap(
-        lambda lower, upper: judge(*hull(network, lower, upper), target, reach_share=reach_share, miss_share=miss_share)
-    )
+
+    @jax.vmap
+    def look(lower: Array, upper: Array) -> tuple[Array, Array, Array]:
+        """The verdict, and the plane that would halve the part: its dimension of largest smear, and the middle."""
+        image, smears = pushed(network, lower, upper)
+        dimension = jnp.argmax(smears)
+        verdict = judge(*image, target, reach_share=reach_share, miss_share=miss_share)
+        return verdict, dimension, (lower[dimension] + upper[dimension]) / 2
+
     place = jnp.arange(parts)
     inside = jnp.all((box[0] <= starts) & (starts < box[1]), axis=-1) * seen
 
-    def halve_open(carry: tuple, rounds_left: Array) -> tuple[tuple, None]:
-        lower, upper, count, part, found, visits = carry
-        open_ = (found == UNKNOWN) & (visits >= min_visits) & (place < count)
+    def is_open(now: Parts) -> Bool[Array, "P"]:
+        return (now.looked[0] == UNKNOWN) & (now.visits >= min_visits) & (place < now.number)
+
+    def goes_on(carry: tuple[Array, Parts]) -> Array:
+        rounds_left, now = carry
+        return (rounds_left > 0) & (now.number < parts) & is_open(now).any()
+
+    def halve_open(carry: tuple[Array, Parts]) -> tuple[Array, Parts]:
+        rounds_left, (lower, upper, count, part, (found, dimension, middle), visits) = carry
+        open_ = is_open(carry[1])
         rank = jnp.argsort(jnp.argsort(jnp.where(open_, -visits, 1.0)))  # most visits first, closed ones last
         halved = open_ & (rank < (parts - count + rounds_left - 1) // rounds_left)
-        dimension, middle = jax.vmap(partial(_halving, network))(lower, upper)
         twin = jnp.where(halved, count + rank, parts)  # where the upper half goes
         at_middle = halved[:, None] & (jnp.arange(lower.shape[1]) == dimension[:, None])
         moved = halved[part] & (starts[jnp.arange(starts.shape[0]), dimension[part]] >= middle[part])
         part = jnp.where(moved, twin[part], part)
         lower = lower.at[twin].set(jnp.where(at_middle, middle[:, None], lower), mode="drop")
         upper = jnp.where(at_middle, middle[:, None], upper).at[twin].set(upper, mode="drop")
-        changed = halved | jnp.zeros(parts, bool).at[twin].set(True, mode="drop")
-        found = jnp.where(changed, judge_all(lower, upper), found)
-        return (lower, upper, count + halved.sum(), part, found, _visits(part, inside, parts)), None
+        now = Parts(lower, upper, count + halved.sum(), part, look(lower, upper), _visits(part, inside, parts))
+        return rounds_left - 1, now
 
     empty = jnp.broadcast_to(box[1], (parts, len(box[1])))
     lower, part = empty.at[0].set(box[0]), jnp.zeros(starts.shape[0], jnp.int32)
-    start = (lower, empty, jnp.ones((), jnp.int32), part, judge_all(lower, empty), _visits(part, inside, parts))
-    (lower, upper, count, _, found, visits), _ = jax.lax.scan(halve_open, start, jnp.arange(depth, 0, -1))
+    whole = Parts(lower, empty, jnp.ones((), jnp.int32), part, look(lower, empty), _visits(part, inside, parts))
+    _, (lower, upper, count, _, (found, *_), visits) = jax.lax.while_loop(
+        goes_on, halve_open, (jnp.asarray(depth), whole)
+    )
     used, enough = place < count, visits >= min_visits
     return Leaves(
         lower=lower, upper=upper, reaches=used & enough & (found == REACHES), visited=used & enough, used=used
@@ -231,10 +260,5 @@ def reaches_where_visited(leaves: Leaves) -> Bool[Array, ""]:
 
 
 def _visits(part: Int[Array, "N"], counted: Float[Array, "N"], parts: int) -> Float[Array, "P"]:
-    return jnp.zeros(parts).at[part].add(counted)
-
-
-def _halving(network: Network, lower: Float[Array, "d"], upper: Float[Array, "d"]) -> tuple[Array, Array]:
-    """The plane that halves a box: its dimension of largest smear, and the middle of that."""
-    dimension = jnp.argmax(smear(network, lower, upper))
-    return dimension, (lower[dimension] + upper[dimension]) / 2
+    """Sums of `counted` in each part. Most starts lie elsewhere: left out, they do not wait for one another."""
+    return jnp.zeros(parts).at[jnp.where(counted > 0, part, parts)].add(counted, mode="drop")

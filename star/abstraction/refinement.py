@@ -4,7 +4,7 @@
         it was commanded `min_transitions` times since i or j changed or it was examined (for (i, i) half of them stay),
         it has no verdict, and
         the forward model's held-out error on it has stopped falling
-    the due pair with most transitions times epochs since it was examined is taken (star/reachability.py):
+    the due pair with most transitions times epochs since it was examined is taken (star/abstraction/reachability.py):
         all parts of i reach j:  edge i -> j, REACHES
         none does:               MISSES, until older than `miss_lifetime` epochs: the low levels are still learning
         some do:                 cut i along the axis that best parts the reaching from the missing leaves
@@ -22,8 +22,9 @@ Source: STAR (ICLR 2024), section 4.3 and algorithm 2.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -173,8 +174,7 @@ def refine(
     graph, before, periods = forget(config, graph), abstraction, forward_model.remembered(model)
     met = reached(goals, cube)
 
-    def one_pair(carry: tuple[Abstraction, Graph], pair_key: Array) -> tuple[tuple[Abstraction, Graph], tuple]:
-        abstraction, graph = carry
+    def one_pair(abstraction: Abstraction, graph: Graph, pair_key: Array) -> tuple[Abstraction, Graph, tuple]:
         region, target, found = _most_urgent(config, abstraction, graph, weight)
         inside = region == target
         goal_key, cut_key = jax.random.split(pair_key)
@@ -196,11 +196,9 @@ def refine(
         settled = judged & ~inside & recorded
         known = jnp.where(settled, verdict, graph.verdict[region, target])
         graph = graph.replace(verdict=graph.verdict.at[region, target].set(known))
-        return (abstraction, graph), (splits, found, mixed)
+        return abstraction, graph, (splits, found, mixed)
 
-    (abstraction, graph), (splits, found, mixed) = jax.lax.scan(
-        one_pair, (abstraction, graph), jax.random.split(key, config.refinement.pairs_per_epoch)
-    )
+    abstraction, graph, (splits, found, mixed) = _each_due(config, abstraction, graph, one_pair, key=key)
     abstraction, graph, more = _separate(config, abstraction, graph, periods, goals, met)
     splits = jax.tree.map(lambda x, other: jnp.concatenate([x.reshape(-1), other]), splits, more)
     metrics = {
@@ -213,6 +211,27 @@ def refine(
         "table_full": (abstraction.count == abstraction.capacity).astype(jnp.int32),
     }
     return graph, Change.of(before, abstraction, splits), metrics
+
+
+def _each_due(
+    config: Settings, abstraction: Abstraction, graph: Graph, one_pair: Callable[..., Any], *, key: Array
+) -> tuple[Abstraction, Graph, Any]:
+    """Do `one_pair` as long as a pair is due, `pairs_per_epoch` times at most; its results, 0 where it was not done."""
+    pairs = config.refinement.pairs_per_epoch
+    keys = jax.random.split(key, pairs)
+    shapes = jax.eval_shape(one_pair, abstraction, graph, keys[0])[2]
+    nothing = jax.tree.map(lambda x: jnp.zeros((pairs, *x.shape), x.dtype), shapes)
+
+    def goes_on(carry: tuple) -> Array:
+        number, abstraction, graph, _ = carry
+        return (number < pairs) & due(config, graph, abstraction.active).any()
+
+    def one(carry: tuple) -> tuple:
+        number, abstraction, graph, told = carry
+        abstraction, graph, more = one_pair(abstraction, graph, keys[number])
+        return number + 1, abstraction, graph, jax.tree.map(lambda all_, x: all_.at[number].set(x), told, more)
+
+    return jax.lax.while_loop(goes_on, one, (0, abstraction, graph, nothing))[1:]
 
 
 def _separate(

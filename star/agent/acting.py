@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import export
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from envs.common import files, plugins
 from envs.common.errors import UserError
@@ -244,7 +244,7 @@ def _decide(
     roadmap: Roadmap,
     memory: Memory,
     obs: Float[Array, "B n"],
-    keys: Float[Array, "3"],
+    keys: Key[Array, "3"],
 ) -> tuple[Memory, Array, Array, Array]:
     """The first env step of a segment: memory for the next one, subgoal, action, and the Controller's plan."""
     agent = levels.of(config, spec, greedy=True)

@@ -35,6 +35,12 @@ def _check_body(config: Config, spec: Spec) -> None:
         raise ValueError(f"tutor.heading: {spec.heading:g}, but the body has no orientation; allowed: null")
     if config.controller.frame == "body" and not (spec.orientation and spec.velocity):
         raise ValueError("controller.frame: body, but the body has no orientation; allowed: world")
+    turns = "controller.frame: body" if config.controller.frame == "body" else "tutor.heading" if spec.heading else ""
+    if turns and spec.abstract_indices[:2] != (0, 1):
+        raise ValueError(
+            f"{turns}: turns x and y, which must be the first two numbers of the state and of abstract_indices, "
+            f"{list(spec.abstract_indices)}"
+        )
     if config.controller.tilt_penalty and not spec.orientation:
         raise ValueError(
             f"controller.tilt_penalty: {config.controller.tilt_penalty:g}, but the body has no orientation; allowed: 0"

@@ -153,17 +153,22 @@ def _shares(
 def experience(
     section: CommanderConfig, task: Task, roadmap: Roadmap, memory: Memory, segment: Segment, marks: Marks
 ) -> tuple[Memory, Finished]:
-    """The memory after a segment, and the periods that came to their end with it; weight 0 elsewhere."""
+    """The memory after a segment, and the periods that came to their end with it; weight 0 elsewhere.
+
+    A period in which success ends the episode counts as if the agent had stayed at the goal for the rest of it.
+    """
     worthy = worth(section, segment.distance, segment.success)
-    last = jnp.sum(worthy * segment.terminated * segment.alive, axis=0)
+    last = jnp.sum(worthy * jnp.maximum(segment.terminated, segment.arrived) * segment.alive, axis=0)
+    arrived = jnp.max(segment.arrived * segment.alive, axis=0)
+    stays = arrived * (section.period - memory.clock - segment.alive.sum(axis=0))  # env steps
     memory = tick(section, memory, steps=len(segment.alive))
-    memory = memory.replace(reward=accumulate(section, memory.reward, worthy, segment.alive))
+    reward = accumulate(section, memory.reward, worthy, segment.alive)
+    memory = memory.replace(reward=reward if section.reward == "max" else reward + stays * last / section.period)
     end, lost = task.spec.abstract(segment.obs[-1]), segment.lost
     early = jnp.maximum(segment.ended[-1], lost)  # what is lost in the last step of an episode has not `ended` early
-    whole_segment = segment.alive[-1] * (1 - early)
+    weight = jnp.maximum(jnp.where(memory.clock == 0, segment.alive[-1] * (1 - early), 0.0), arrived)
     if marks.own is not None:  # random subgoals tell nothing of where commands lead
-        whole_segment, lost = whole_segment * marks.own, lost * marks.own
-    weight = jnp.where(memory.clock == 0, whole_segment, 0.0)
+        weight, lost = weight * marks.own, lost * marks.own
     decision = Decision(
         region=memory.region,
         goal_region=memory.goal_region,
@@ -266,7 +271,7 @@ def lost_reward(section: CommanderConfig, reward: Float[Array, "B"], last: Float
 
 
 def start_reward(section: CommanderConfig) -> float:
-    """The terms of a period's reward."""
+    """A period's reward before its first env step."""
     return -jnp.inf if section.reward == "max" else 0.0
 
 

@@ -59,12 +59,16 @@ def plan(
     section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, due: Bool[Array, ""] | None = None
 ) -> CommanderState:
     """Values by what is known now, where it is `due` (None: now)."""
-    now = partial(_plan, section, roadmap)
-    return now(state) if due is None else jax.lax.cond(due, now, lambda same: same, state)
+    model = _model(state)
+    now, as_it_is = partial(_plan, section, roadmap, state), (state.q, model.reach)
+    q, reach = now() if due is None else jax.lax.cond(due, now, lambda: as_it_is)
+    return state.replace(q=q, model=model.replace(reach=reach))
 
 
-def _plan(section: CommanderConfig, roadmap: Roadmap, state: CommanderState) -> CommanderState:
-    """`section.sweeps` sweeps of value iteration on the model, from the values of last time.
+def _plan(
+    section: CommanderConfig, roadmap: Roadmap, state: CommanderState
+) -> tuple[Float[Array, "R R R"], Float[Array, "R R R"]]:
+    """Q and `reach` by `section.sweeps` sweeps of value iteration on the model, from the values of last time.
 
     As long as nothing is known, region j is held reachable from i where `believed` [i, j], and who aims at a goal in
     his own region is taken to succeed (or, with rewards that are negative, to lose nothing anywhere).
@@ -74,7 +78,7 @@ def _plan(section: CommanderConfig, roadmap: Roadmap, state: CommanderState) -> 
     pursued = jnp.broadcast_to(jnp.eye(state.chosen.shape[0])[..., None], reward.shape)
     values, rewards = jnp.stack([state.q, model.reach]), jnp.stack([reward, pursued])
     q, reach = _iterated(section, roadmap.allowed, values, rewards, chances, sweeps=section.sweeps)
-    return state.replace(q=q, model=model.replace(reach=reach))
+    return q, reach
 
 
 def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, periods: int) -> CommanderState:

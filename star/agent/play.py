@@ -9,6 +9,7 @@ Clocks restart with every episode. Environments that end early wait until the se
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -53,7 +54,8 @@ class Episode(struct.PyTreeNode):
     @classmethod
     def start(cls, distance: Float[Array, "B"]) -> Episode:
         """Before the first step, `distance` m from the goal."""
-        return cls(*[jnp.zeros_like(distance)] * 8).replace(distance=distance)
+        zero = jnp.zeros_like(distance)
+        return cls(**{field.name: zero for field in dataclasses.fields(cls)}).replace(distance=distance)
 
     def after(self, env_state: EnvState, alive: Float[Array, "B"]) -> Episode:
         """With one more env step, to `env_state`, of those that were `alive`."""
@@ -189,12 +191,14 @@ def rollout(
         recorded = record(before, subgoal, box, action) if record else None
         after = env.step(before, action)
         moved = hierarchy.follow(agent, subgoal, before.obs, after.obs)
+        ended = after.done * (after.info["steps"] < length)
         steps = {
             "action": action,
             "success": after.metrics["success"],
             "distance": after.metrics["distance"],
             "terminated": _lost(after),
-            "ended": after.done * (after.info["steps"] < length),
+            "ended": ended,
+            "arrived": ended * after.metrics["success"] * (1 - _mishap(after)) * (1 - _fault(after)),
             "alive": alive,
             "non_finite": after.metrics["non_finite"],
             "overflow": after.metrics["overflow"],
@@ -218,14 +222,23 @@ def rollout(
 
 def _lost(after: EnvState) -> Array:
     """1 where the task ended the episode, but not where success alone did: that is bootstrapped like a time limit."""
-    mishap = jnp.stack([after.metrics[name] for name in MISHAPS]).max(axis=0)
-    return after.done * (1 - after.info["truncation"]) * jnp.maximum(mishap, 1 - after.metrics["success"])
+    return after.done * (1 - after.info["truncation"]) * jnp.maximum(_mishap(after), 1 - after.metrics["success"])
+
+
+def _mishap(after: EnvState) -> Array:
+    """1 where the body lies or stands as it should not."""
+    return jnp.stack([after.metrics[name] for name in MISHAPS]).max(axis=0)
+
+
+def _fault(after: EnvState) -> Array:
+    """1 where the simulator failed."""
+    return jnp.maximum(after.metrics["non_finite"], after.metrics["overflow"])
 
 
 def restart_ended(agent: Agent, env: VectorEnv, streams: Streams, passed: Segment, *, key: Array) -> Streams:
     """Reset the environments that ended early in this segment, with clocks and statistics at their start.
 
-    What SGIM has chosen for them holds again, from its beginning.
+    What SGIM has chosen for them holds again, from its beginning. Who has been at the goal before stays counted.
     """
     ended = passed.over > 0
     env_state = env.reset_where(streams.env, ended, key)
@@ -233,5 +246,6 @@ def restart_ended(agent: Agent, env: VectorEnv, streams: Streams, passed: Segmen
         agent.config.sgim, agent.task.spec, env, streams.lesson, env_state, ended, distance=streams.episode.distance
     )
     clock = jnp.where(ended, 0, streams.memory.clock)
-    episode = where(ended, Episode.start(env_state.metrics["distance"]), streams.episode)
+    begun = Episode.start(env_state.metrics["distance"]).replace(success_any=streams.episode.success_any)
+    episode = where(ended, begun, streams.episode)
     return Streams(env=env_state, memory=streams.memory.replace(clock=clock), lesson=lesson, episode=episode)

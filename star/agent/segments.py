@@ -27,7 +27,8 @@ class Segment(struct.PyTreeNode):
     """A segment of B environments, step by step: leading axes [l, B], or [l + 1, B] with both its ends.
 
     `alive` is 1 until the environment has ended. `ended` is 1 where an episode ends before its time, `terminated` where
-    nothing is to be bootstrapped either. `non_finite` and `overflow` are 1 where that is because the simulator failed.
+    nothing is to be bootstrapped either, and `arrived` where success ended it. `non_finite` and `overflow` are 1 where
+    the simulator failed.
     """
 
     obs: Float[Array, "l+1 B obs"]
@@ -38,6 +39,7 @@ class Segment(struct.PyTreeNode):
     terminated: Float[Array, "l B"]
     ended: Float[Array, "l B"]
     success: Float[Array, "l B"]
+    arrived: Float[Array, "l B"]
     distance: Float[Array, "l B"]
     alive: Float[Array, "l B"]
     non_finite: Float[Array, "l B"]

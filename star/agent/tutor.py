@@ -31,7 +31,7 @@ from star.abstraction.regions import Box
 from star.agent.sections import TutorConfig
 from star.agent.segments import Choice, Policy, Segment
 from star.agent.task import Task
-from star.learners.replay import Imitation, Penalty, Transition, flatten
+from star.learners.replay import Imitation, Penalty, Transition, flatten, weighted_mean
 from star.sgim.lessons import Marks
 
 Metrics = dict[str, Array]
@@ -185,7 +185,7 @@ def learn(
     state, metrics = learners.update(
         section, state, batch, relabel=relabel, penalty=penalty, imitation=imitation, key=key
     )
-    return state, metrics | {"reward": batch.reward.mean()}
+    return state, metrics | {"reward": weighted_mean(batch.reward, batch.weight)}
 
 
 def began(section: TutorConfig, batch: Transition) -> Float[Array, "*batch p"]:

@@ -40,7 +40,7 @@ def choose(
     region: Int[Array, "B"],
     goal_region: Int[Array, "B"],
     *,
-    practised: Int[Array, "B"] | None = None,
+    practised: Int[Array, "B"],
     attraction: Float[Array, "R"] | None = None,
     epsilon: Float[Array, "B"] | float,
     key: Array,
@@ -51,11 +51,9 @@ def choose(
     goal where they are not negative.
     """
     explore_key, random_key, tie_key = jax.random.split(key, 3)
-    values = state.q[region, goal_region]
-    if practised is not None:
-        reach = state.q if state.model is None else state.model.reach
-        values = jnp.where((practised >= 0)[:, None], reach[region, practised], values)
-    pursued = goal_region if practised is None else jnp.where(practised >= 0, practised, goal_region)
+    reach = state.q if state.model is None else state.model.reach
+    values = jnp.where((practised >= 0)[:, None], reach[region, practised], state.q[region, goal_region])
+    pursued = jnp.where(practised >= 0, practised, goal_region)
     best_values = jnp.where(targets(allowed.greedy, region, pursued), values, -jnp.inf)
     ties = best_values >= best_values.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best_values.shape), -1.0), axis=-1)

@@ -13,8 +13,12 @@ from star.abstraction.forward_model import Outcome
 from star.abstraction.regions import Change
 from star.agent import commander, goal_only, planning, values
 from star.agent.decisions import Decision, Finished, Roadmap, Successors, successors
+from star.agent.segments import Segment
+from star.agent.task import Task
 from star.agent.values import CommanderState, Model
 from star.config import loading
+from star.sgim.lessons import Marks
+from star.spec import Spec
 
 R, N = 5, 40
 
@@ -452,6 +456,42 @@ def test_the_reward_of_a_period_is_the_max_or_mean_over_all_its_steps(reward):
         lived = [external[p, t, b] for p in range(3) for t in range(10) if alive[p, t, b]]
         expected = max(lived) if reward == "max" else sum(lived) / 30
         np.testing.assert_allclose(np.asarray(total)[b], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("reward", ["success", "mean", "max"])
+@pytest.mark.parametrize("clock", [2, 4])
+def test_a_period_that_success_ends_counts_as_if_the_agent_stayed_for_the_rest_of_it(reward, clock):
+    """A segment of two env steps in a period of six: one arrives at once, one flips, one goes on."""
+    chosen = loading.parse({"commander": {"reward": reward, "period": 6}, "tutor": {"period": 2}}).commander
+    spec = Spec(
+        state_dim=2, action_size=1, episode_length=6, abstract_indices=(0, 1), goal_indices=(0, 1), success_radius=1.0,
+        subgoal_scale=(1.0, 1.0), space=((0.0, 0.0), (9.0, 9.0)), region_cuts=((), ()),
+    )  # fmt: skip
+    task, table = Task.of(loading.parse({}), spec), regions.create(spec.space, [[3.0], []], max_regions=2)
+    obs, end = np.full((3, 3, 4), 5.0, np.float32), np.float32([[1, 0, 0], [0, 0, 0]])
+    obs[0, ..., :2] = 1.0  # in the other region
+    distance, so_far = np.float32([[3, 3, 3], [9, 9, 2]]), {"success": 0.0, "mean": -9 / 6, "max": -4.0}[reward]
+    flipped, none = end[:, [1, 0, 2]], np.zeros((2, 3), np.float32)
+    passed = Segment(
+        obs=obs, seen=(), subgoal=(), action=none, terminated=flipped, ended=end + flipped, success=end, arrived=end,
+        distance=distance, alive=np.float32([[1, 1, 1], [0, 0, 1]]), non_finite=none, overflow=none, box=None,
+        choice=None,
+    )  # fmt: skip
+    roadmap = Roadmap(abstraction=table, allowed=EVERYTHING, believed=None)
+    memory = commander.blank(obs[0, :, :2])
+    memory = memory.replace(clock=memory.clock + clock, reward=jnp.full(3, so_far), region=memory.region)
+    run = jax.jit(lambda memory, passed: commander.experience(chosen, task, roadmap, memory, passed, Marks()))
+    after, (decision, outcome) = jax.device_get(run(memory, passed))
+    whole = float(clock == 4)
+    assert decision.weight.tolist() == outcome.weight.tolist() == [1.0, 0.0, whole] and decision.lost.tolist() == [
+        0,
+        1,
+        0,
+    ]
+    assert (decision.region[0], decision.next_region[0], after.clock[0]) == (0, 1, (clock + 2) % 6)
+    left = 6 - clock - 1
+    expected = {"success": (1 + left) / 6, "mean": so_far - 3 / 6 - left * 3 / 6, "max": -3.0}[reward]
+    np.testing.assert_allclose(decision.reward[0], expected, rtol=1e-6)
 
 
 # Regions 0, 1, 2 become 0, 1, 2 and 3, of which 1 and 3 were cut from 1; region 4 is not in use.

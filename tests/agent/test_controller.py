@@ -127,6 +127,17 @@ def test_a_box_in_place_of_a_subgoal_moves_whole_and_is_as_far_as_its_nearest_po
     np.testing.assert_allclose(got, [1.0, -1.0, 5.0 - np.hypot(4, 2)], rtol=1e-6)
 
 
+@pytest.mark.parametrize("settings", [{"controller": {"frame": "body"}}, {"tutor": {"heading": 2.0}}])
+@pytest.mark.parametrize("abstract", [(0, 2), (2, 3), (2,)])
+def test_a_place_that_is_no_x_and_y_cannot_be_turned(settings, abstract):
+    spec = knowledge(abstract=abstract, heading=settings.get("tutor", {}).get("heading"))
+    what = "tutor.heading" if "tutor" in settings else "controller.frame: body"
+    with pytest.raises(
+        ValueError, match=f"{what}: turns x and y, which must be the first two .* {list(abstract)}"[:-1]
+    ):
+        checks.check(loading.parse(settings), spec)
+
+
 def test_a_body_that_faces_nowhere_has_no_axes_of_its_own():
     point = Spec.of(envs.make("point_maze"))
     with pytest.raises(ValueError, match="controller.frame: body, but the body has no orientation; allowed: world"):

@@ -188,7 +188,7 @@ def test_an_episode_that_has_just_begun_counts_as_far_from_its_goal_as_its_start
     np.testing.assert_allclose(recording.before.episode.distance[begun], away[begun], rtol=1e-5)
 
 
-def test_episode_statistics_are_those_of_the_steps_since_the_last_reset(recording):
+def test_episode_statistics_are_those_of_the_steps_since_the_last_reset_but_success_any_of_all(recording):
     any_, total, there = np.zeros(B), np.zeros(B), np.zeros(B)
     for i, b in streams_and_segments(recording):
         for t in range(L):
@@ -206,7 +206,7 @@ def test_episode_statistics_are_those_of_the_steps_since_the_last_reset(recordin
         np.testing.assert_allclose(seen.distance[i, b], distance, rtol=1e-5)
         np.testing.assert_allclose(seen.total[i, b], total[b], rtol=1e-4)
         if ended(recording, i, b):
-            any_[b] = total[b] = there[b] = 0
+            total[b] = there[b] = 0
     np.testing.assert_allclose(recording.last.episode.total, total, rtol=1e-4)
 
 
@@ -274,6 +274,24 @@ def test_subgoals_with_a_heading_stay_where_they_are_while_the_agent_moves_and_t
     wanted = (pose + passed.subgoal[:-1])[:, going]
     assert going.any() and (np.ptp(pose[:, going], axis=0) > 1e-3).all()
     np.testing.assert_allclose(wanted, np.broadcast_to(wanted[0], wanted.shape), atol=1e-3)
+
+
+def test_who_was_at_the_goal_before_an_episode_ended_is_counted_in_the_next_one(breaking_env, tiny, fresh):
+    agent, spec = loading.parse(tiny).hyper(), Spec.of(breaking_env.env)
+    playing, ended = levels.of(agent, spec), np.arange(B) % 2
+    row = np.float32(ended)[None]
+
+    def restarted(state, key):
+        streams = play.start(playing, breaking_env, key=key)
+        choice = Choice(subgoal=jnp.zeros((B, len(spec.scale))))
+        streams, passed = play.rollout(playing, breaking_env, state, streams, choice, explore=True, key=key)
+        there = streams.episode.replace(success_any=jnp.ones(B), time_at_goal=jnp.ones(B))
+        passed = passed.replace(ended=row, alive=jnp.ones_like(row))
+        return play.restart_ended(playing, breaking_env, streams.replace(episode=there), passed, key=key).episode
+
+    episode = jax.device_get(jax.jit(restarted)(fresh(3), jax.random.key(0)))
+    assert (episode.success_any == 1).all()
+    np.testing.assert_array_equal(episode.time_at_goal, 1 - ended)
 
 
 def scene_of(spec, env_state):

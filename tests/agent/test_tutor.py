@@ -1,6 +1,7 @@
 """The Tutor's view, subgoals, reward and off-policy correction."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -78,7 +79,8 @@ def test_a_box_around_a_goal_close_by_is_aimed_at_and_teaches_nothing(straight):
         choice = tutor.act(section, known, state, jnp.asarray(obs), box, marks, explore=True, key=key)
         passed = Segment(
             obs=jnp.stack([obs] * (L + 1)), seen=(), subgoal=(), action=steps, terminated=steps, ended=steps,
-            success=steps, distance=steps, alive=steps + 1, non_finite=steps, overflow=steps, box=box, choice=choice,
+            success=steps, arrived=steps, distance=steps, alive=steps + 1, non_finite=steps, overflow=steps,
+            box=box, choice=choice,
         )  # fmt: skip
         return choice, tutor.experience(section, known, passed, marks, renewed=jnp.zeros(3, bool))
 
@@ -86,6 +88,13 @@ def test_a_box_around_a_goal_close_by_is_aimed_at_and_teaches_nothing(straight):
     aimed = np.linalg.norm(choice.subgoal - (box.centre - obs[:, :2]), axis=1) < 1e-6
     assert aimed.tolist() == [straight, False, False]
     np.testing.assert_array_equal(learnt.weight, [0.0 if straight else 1.0, 1.0, 1.0])
+
+
+def test_the_reward_told_is_that_of_decisions_that_teach(monkeypatch):
+    batch = SimpleNamespace(reward=jnp.array([1.0, 5.0, 9.0]), weight=jnp.array([1.0, 1.0, 0.0]))
+    monkeypatch.setattr(tutor.learners, "update", lambda section, state, batch, **_: (state, {}))
+    others = {"below": None, "penalty": None, "imitate": None, "key": jax.random.key(0)}
+    assert tutor.learn(settings(), task(), (), batch, **others)[1]["reward"] == 3.0
 
 
 def test_subgoals_are_clipped_to_their_scale():

@@ -459,7 +459,8 @@ def lived(obs, box, choice, *, terminated=0.0):
     steps = jnp.zeros((L, len(obs)))
     return Segment(
         obs=jnp.stack([obs] * (L + 1)), seen=(), subgoal=(), action=steps, terminated=steps + terminated, ended=steps,
-        success=steps, distance=steps, alive=steps + 1, non_finite=steps, overflow=steps, box=box, choice=choice,
+        success=steps, arrived=steps, distance=steps, alive=steps + 1, non_finite=steps, overflow=steps,
+        box=box, choice=choice,
     )  # fmt: skip
 
 
