@@ -132,9 +132,7 @@ def test_a_box_in_place_of_a_subgoal_moves_whole_and_is_as_far_as_its_nearest_po
 def test_a_place_that_is_no_x_and_y_cannot_be_turned(settings, abstract):
     spec = knowledge(abstract=abstract, heading=settings.get("tutor", {}).get("heading"))
     what = "tutor.heading" if "tutor" in settings else "controller.frame: body"
-    with pytest.raises(
-        ValueError, match=f"{what}: turns x and y, which must be the first two .* {list(abstract)}"[:-1]
-    ):
+    with pytest.raises(ValueError, match=f"{what}: turns x and y, which must be the first two numbers"):
         checks.check(loading.parse(settings), spec)
 
 
