@@ -54,7 +54,7 @@ def learn(
     }
     metrics["commander/ground"] = _ground(spec, finished.outcome)
     periods = num_envs * (spec.episode_length // section.period)
-    decision, outcome = _complete(finished, min(periods, config.forward_model.buffer_size), key=pick_key)
+    decision, outcome = _complete(finished, periods, key=pick_key)
     goals = outcome.replace(weight=outcome.weight * decision.at_goal)
     state, more = _learn_where_commands_lead(config, state, decision, outcome, key=train_key)
     metrics |= more
@@ -120,7 +120,8 @@ def _learn_where_commands_lead(
     graph = refinement.observe(
         config, state.graph, region=decision.region, target=decision.target, error=error, weight=counted
     )
-    model, metrics = forward_model.train(section, state.forward_model, outcome, key=key)
+    kept = jax.tree.map(lambda x: x[: section.buffer_size], outcome)  # they are in random order
+    model, metrics = forward_model.train(section, state.forward_model, kept, key=key)
     metrics |= {"error": jnp.sqrt(weighted_mean(error, outcome.weight))}
     return state.replace(forward_model=model, graph=graph), {
         f"forward_model/{name}": value for name, value in metrics.items()
@@ -137,7 +138,7 @@ def _ground(spec: Spec, outcome: Outcome) -> Array:
 
 
 def _complete(finished: Finished, size: int, *, key: Array) -> Finished:
-    """A random `size` of the complete ones among all recorded periods, first by weight."""
+    """`size` of all recorded periods in random order, but the complete ones first."""
     weight = finished.outcome.weight
     order = jnp.argsort(weight + jax.random.uniform(key, weight.shape, maxval=0.5), descending=True)[:size]
     return jax.tree.map(lambda x: x[order], finished)

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from star.abstraction import refinement
+from star.abstraction import forward_model, refinement, regions
 from star.abstraction.forward_model import Outcome
-from star.agent import checks, commander, controller, epoch, levels
+from star.agent import between_episodes, checks, commander, controller, epoch, levels
 from star.agent.decisions import Decision, Finished
 from star.agent.task import Task
 from star.config import loading
@@ -256,6 +256,33 @@ def test_early_ends_are_counted_by_their_reason(first):
         assert count == round(count) and 0 < count <= B * 30 // L
     assert float(metrics["env/overflow"]) == 0
     assert float(metrics["env/obs_non_finite"]) == 0
+
+
+def test_periods_beyond_the_room_of_the_buffer_count_for_refinement_too(tiny):
+    config = loading.parse(tiny, {"forward_model.buffer_size": 8}).hyper()
+    n, space = 10, np.float32([[0, 0], [9, 9]])
+    point = np.random.default_rng(0).uniform(1, 8, (n, 2)).astype(np.float32)
+    whole, none = np.ones(n, np.float32), np.zeros(n, np.int32)
+    outcome = Outcome(start=point, lower=point - 1, upper=point + 1, end=point, weight=whole)
+    decision = Decision(
+        region=none, goal_region=none, target=none + 1, reward=none, next_region=none, weight=whole, lost=none,
+        practised=none, aside=none, goal=point,
+    )  # fmt: skip
+
+    @jax.jit
+    def learnt(key):
+        state = SimpleNamespace(
+            forward_model=forward_model.init(key, config.forward_model, space=space),
+            graph=refinement.init(capacity=2),
+            abstraction=regions.create(tuple(space), [[3.0], []], max_regions=2),
+            replace=lambda **parts: SimpleNamespace(**parts),
+        )
+        after, _ = between_episodes._learn_where_commands_lead(config, state, decision, outcome, key=key)
+        return after.graph, forward_model.remembered(after.forward_model)
+
+    graph, kept = jax.device_get(learnt(jax.random.key(0)))
+    assert graph.transitions[0, 1] == n
+    np.testing.assert_array_equal(kept.start, point[:8])
 
 
 def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(first):
