@@ -6,7 +6,7 @@ lead to the same actions, bit for bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -41,18 +41,6 @@ class Regions(NamedTuple):
     upper: Float[np.ndarray, "n d"]
 
 
-class _Functions(NamedTuple):
-    """The jitted functions of an agent. Settings and state come first."""
-
-    begin: Callable[..., tuple[TrainState, Roadmap, Memory, Array]]
-    decide: Callable[..., tuple[Memory, Array, Array, Array]]
-    go_on: Callable[..., tuple[Array, Array, Array]]
-
-    @classmethod
-    def of(cls, spec: Spec) -> _Functions:
-        return cls(*(jax.jit(partial(function, spec)) for function in (_begin, _decide, _go_on)))
-
-
 @dataclass
 class _Episode:
     """State of the hierarchy in the episodes of B bodies, after `steps` env steps.
@@ -83,7 +71,6 @@ class TrainedAgent:
         """The one that it was trained with."""
         self.spec: Spec = program.experiment.tested_spec
         """Its knowledge of the task: sizes, and which entries of the state positions and goals are."""
-        self._functions = _Functions.of(self.spec)
         self._episode: _Episode | None = None
         self.reset()
 
@@ -132,14 +119,14 @@ class TrainedAgent:
         episode = self._episode = self._episode or self._begun(batch)
         self._check(episode, batch)
         segment, within = divmod(episode.steps, self.config.tutor.period)
-        hyper, functions = self._program.hyper, self._functions
+        spec, hyper = self.spec, self._program.hyper
         if within == 0:
-            episode.memory, episode.subgoal, action, episode.plan = functions.decide(
-                hyper, episode.state, episode.roadmap, episode.memory, batch, episode.keys[segment]
+            episode.memory, episode.subgoal, action, episode.plan = _decide(
+                spec, hyper, episode.state, episode.roadmap, episode.memory, batch, episode.keys[segment]
             )
         else:
-            episode.subgoal, action, episode.plan = functions.go_on(
-                hyper, episode.state, episode.subgoal, episode.before, batch, episode.plan, within
+            episode.subgoal, action, episode.plan = _go_on(
+                spec, hyper, episode.state, episode.subgoal, episode.before, batch, episode.plan, within
             )
         episode.before, episode.steps = batch, episode.steps + 1
         episode.shape = given.shape[:-1]
@@ -207,7 +194,7 @@ class TrainedAgent:
             partial_path.write_bytes(written)
 
     def _begun(self, obs: Float[np.ndarray, "B n"]) -> _Episode:
-        return _Episode(*self._functions.begin(self._program.hyper, self._state, obs, self._key))
+        return _Episode(*_begin(self.spec, self._program.hyper, self._state, obs, self._key))
 
     def _check(self, episode: _Episode, obs: np.ndarray) -> None:
         """Raise `UserError` for another number of bodies, or after the end of the episode."""
@@ -227,6 +214,7 @@ def load(run_dir: Path, *, checkpoint: str = "last", seed: int | None = None) ->
     return TrainedAgent(program, state, run_dir=run_dir, env_steps=env_steps, seed=program.seeds[number])
 
 
+@partial(jax.jit, static_argnames="spec")  # agents of one kind share it
 def _begin(
     spec: Spec, config: AgentConfig, state: TrainState, obs: Float[Array, "B n"], key: Array
 ) -> tuple[TrainState, Roadmap, Memory, Array]:
@@ -237,6 +225,7 @@ def _begin(
     return *hierarchy.prepare(agent, state), memory, keys
 
 
+@partial(jax.jit, static_argnames="spec")  # agents of one kind share it
 def _decide(
     spec: Spec,
     config: AgentConfig,
@@ -256,6 +245,7 @@ def _decide(
     return memory, choice.subgoal, *hierarchy.act(agent, state, seen, plan, number=0, explore=False, key=keys[2])
 
 
+@partial(jax.jit, static_argnames="spec")  # agents of one kind share it
 def _go_on(
     spec: Spec,
     config: AgentConfig,
