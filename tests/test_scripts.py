@@ -470,13 +470,13 @@ def test_the_check_of_soundness_judges_all_pairs_and_notices_a_hull_that_is_too_
     for name, lost in (("strict", "do_not_arrive"), ("trained", "outside_hull")):
         assert row[name]["parts"] >= 2 and row[name]["points"] == row[name]["parts"] * 54
         assert row[name][lost] == row[name]["outside_hull"] == 0
-    hull = reachability.hull
+    pushed = reachability.pushed
 
     def middle(*box):
-        low, high = hull(*box)
-        return 0.6 * low + 0.4 * high, 0.4 * low + 0.6 * high
+        (low, high), smear = pushed(*box)
+        return (0.6 * low + 0.4 * high, 0.4 * low + 0.6 * high), smear
 
-    monkeypatch.setattr(reachability, "hull", middle)
+    monkeypatch.setattr(reachability, "pushed", middle)
     row = script.check_verdicts(agent, state, points=50)
     assert row["strict"]["do_not_arrive"] > 0 and row["trained"]["outside_hull"] > 0
 

@@ -223,18 +223,10 @@ def examine(
         return (rounds_left > 0) & (now.number < parts) & is_open(now).any()
 
     def halve_open(carry: tuple[Array, Parts]) -> tuple[Array, Parts]:
-        rounds_left, (lower, upper, count, part, (found, dimension, middle), visits) = carry
-        open_ = is_open(carry[1])
-        rank = jnp.argsort(jnp.argsort(jnp.where(open_, -visits, 1.0)))  # most visits first, closed ones last
-        halved = open_ & (rank < (parts - count + rounds_left - 1) // rounds_left)
-        twin = jnp.where(halved, count + rank, parts)  # where the upper half goes
-        at_middle = halved[:, None] & (jnp.arange(lower.shape[1]) == dimension[:, None])
-        moved = halved[part] & (starts[jnp.arange(starts.shape[0]), dimension[part]] >= middle[part])
-        part = jnp.where(moved, twin[part], part)
-        lower = lower.at[twin].set(jnp.where(at_middle, middle[:, None], lower), mode="drop")
-        upper = jnp.where(at_middle, middle[:, None], upper).at[twin].set(upper, mode="drop")
-        now = Parts(lower, upper, count + halved.sum(), part, look(lower, upper), _visits(part, inside, parts))
-        return rounds_left - 1, now
+        rounds_left, now = carry
+        room = (parts - now.number + rounds_left - 1) // rounds_left
+        lower, upper, number, part = _halved(now, is_open(now), starts, most=room)
+        return rounds_left - 1, Parts(lower, upper, number, part, look(lower, upper), _visits(part, inside, parts))
 
     empty = jnp.broadcast_to(box[1], (parts, len(box[1])))
     lower, part = empty.at[0].set(box[0]), jnp.zeros(starts.shape[0], jnp.int32)
@@ -257,6 +249,23 @@ def summary(leaves: Leaves) -> Int[Array, ""]:
 def reaches_where_visited(leaves: Leaves) -> Bool[Array, ""]:
     """True if there are visited leaves and all of them reach."""
     return leaves.visited.any() & (leaves.reaches | ~leaves.visited).all()
+
+
+def _halved(
+    now: Parts, open_: Bool[Array, "P"], starts: Float[Array, "N d"], *, most: Int[Array, ""]
+) -> tuple[Float[Array, "P d"], Float[Array, "P d"], Int[Array, ""], Int[Array, "N"]]:
+    """Corners, number and `part` after halving `open_` parts, at `most` so many, those with most visits first."""
+    lower, upper, number, part, (_, dimension, middle), visits = now
+    places, d = lower.shape
+    rank = jnp.argsort(jnp.argsort(jnp.where(open_, -visits, 1.0)))  # closed ones last
+    halved = open_ & (rank < most)
+    twin = jnp.where(halved, number + rank, places)  # where the upper half goes
+    at_middle = halved[:, None] & (jnp.arange(d) == dimension[:, None])
+    moved = halved[part] & (starts[jnp.arange(len(starts)), dimension[part]] >= middle[part])
+    part = jnp.where(moved, twin[part], part)
+    lower = lower.at[twin].set(jnp.where(at_middle, middle[:, None], lower), mode="drop")
+    upper = jnp.where(at_middle, middle[:, None], upper).at[twin].set(upper, mode="drop")
+    return lower, upper, number + halved.sum(), part
 
 
 def _visits(part: Int[Array, "N"], counted: Float[Array, "N"], parts: int) -> Float[Array, "P"]:

@@ -226,7 +226,6 @@ def _lost(after: EnvState) -> Array:
 
 
 def _mishap(after: EnvState) -> Array:
-    """1 where the body lies or stands as it should not."""
     return jnp.stack([after.metrics[name] for name in MISHAPS]).max(axis=0)
 
 
