@@ -28,7 +28,7 @@ def test_the_page_and_the_tables_keep_step_with_the_json_files(rows):
     for name, table in page.tables(rows).items():
         text = (ROOT / name).read_text(encoding="utf-8")
         assert page.with_table(text, table) == text, RENEW
-    assert sum(any(map(str.isalnum, word)) for word in made.split()) < 600  # bars of tables are no words
+    assert len(made.split()) < 600
 
 
 def test_the_charts_keep_step_with_the_json_files(rows):
@@ -90,7 +90,7 @@ def test_who_is_ahead_is_told_only_where_the_interval_leaves_out_zero():
     wide = {"ant_maze/star": row(0.9, 0.95, 0.9), "ant_maze/gara": row(0.2, 1.0, 0.9), "ant_maze/flat": row(0, 0.01, 0)}
     gara, flat = page.verdicts(wide)
     assert "| not told apart | +0.22 [" in gara and "| ahead | +0.91 [" in flat
-    assert gara.endswith("] | 16.4/16.4 | 3/3 |")
+    assert gara.endswith("] | 3x16.4/3x16.4 |")
     assert "| behind | " in page.verdicts({"ant_maze/star": wide["ant_maze/flat"], "ant_maze/gara": row(1, 1, 1)})[0]
     assert page.unmeasured(wide).startswith("STAR on Ant Maze Cam, Ant Fall, labyrinth; GARA on ")
 

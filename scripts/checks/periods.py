@@ -24,10 +24,8 @@ import numpy as np
 from envs.common.errors import UserError
 from envs.vector import VectorEnv
 from star.abstraction import regions
-from star.agent import hierarchy, levels, play, values
+from star.agent import acting, hierarchy, levels, play, values
 from star.agent.state import TrainState
-from star.config.loading import load_to_act
-from star.training import checkpoint as saved
 from star.training import program as programs
 from star.training.program import Program
 
@@ -133,14 +131,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--commands", type=int, default=5)
     options = parser.parse_args(arguments)
     try:
-        program = programs.build(load_to_act(options.run, {}))
+        program, number, state, env_steps = acting.read(options.run, checkpoint=options.checkpoint, seed=options.seed)
         if not program.config.commander.enabled:
             raise UserError(f"{options.run}: has no Commander, so there are no periods")
-        number = saved.agent_number(program.seeds, options.run, options.seed)
-        env_steps, states = saved.load_state(program, options.run, options.checkpoint)
     except UserError as error:
         parser.exit(2, f"error: {error}\n")
-    state = saved.of_one(states, number)
     key = program.evaluation_keys(0, stream=programs.AFTERWARDS)[number]
     told, plan = played(program, state, key, options.episodes), Plan(program, state)
     goal_region = plan.region(told.goal)

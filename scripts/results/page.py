@@ -62,6 +62,22 @@ PARTS = {
     "no refinement": "no_refinement",
 }
 
+LAST = """## Other learners
+
+[SGIM](sgim.md#what-it-does-there), [SGIM-SAHT](saht.md) and [tutors of students](tutoring.md) have pages of their own.
+
+## Measure a row again
+
+```bash
+python scripts/results/reproduce.py ant_maze/one_by_one/star ant_labyrinth/gara  # GPU
+python scripts/results/page.py --digests
+```
+
+The first goes on where it was interrupted. A row holds seeds, command, commit, device, versions and
+[learning digest](glossary.md#measurement). `results/README.md` lists all raw figures. Earlier ones are in the
+[notebook](notebook/results.md).
+"""
+
 
 class Row(NamedTuple):
     """A measured agent: its JSON, and whether its digest is today's."""
@@ -153,10 +169,14 @@ def verdicts(rows: Mapping[str, Row]) -> list[str]:
         for agent, name in list(AGENTS.items())[1:]:
             theirs = rows.get(f"{folder}/{name}")
             if ours and theirs:
-                budgets = "/".join(f"{row.report['env_steps_per_seed'] / 1e6:.1f}" for row in (ours, theirs))
-                seeds = "/".join(str(len(row.report["seeds"])) for row in (ours, theirs))
-                lines.append(f"| {agent}{theirs.mark}, {task} | {_difference(ours, theirs)} | {budgets} | {seeds} |")
+                budgets = "/".join(map(_budget, (ours, theirs)))
+                lines.append(f"| {agent}{theirs.mark}, {task} | {_difference(ours, theirs)} | {budgets} |")
     return lines
+
+
+def _budget(row: Row) -> str:
+    """Seeds x million env steps of each."""
+    return f"{len(row.report['seeds'])}x{row.report['env_steps_per_seed'] / 1e6:.1f}"
 
 
 def _difference(ours: Row, theirs: Row) -> str:
@@ -201,25 +221,24 @@ def page(rows: Mapping[str, Row]) -> str:
   [95 % interval](evaluation.md#intervals). Each seed plays 100 or 200 episodes with starts unseen in training.
 * *published*: the same in the [paper](https://arxiv.org/abs/2401.09870), after 10 to 13 hours of training.
 * *to .9*: median over seeds of the seconds of training to a success of .9, without compilation and evaluation.
-* Seeds of the first three tasks trained one by one, those of other rows side by side.
+* Seeds of the first three tasks trained one by one, others side by side.
 
 ## Beside other agents
 
 ![Success of STAR and other agents on four ant tasks](images/results_agents.png)
 
-| STAR beside | STAR is | difference in success | million env steps | seeds |
-|---|---|---|---|---|
+| STAR beside | STAR is | difference in success | seeds x M env steps |
+|---|---|---|---|
 {chr(10).join(verdicts(rows))}
 
-Bars are means over seeds, lines 95 % intervals. Differences have Welch's interval. Env steps and seeds are those of
-STAR and of the other. These runs are not those above: all seeds of an agent train side by side. GARA here is STAR
-without its Tutor, with a longer horizon and no tilt penalty.
+Bars are means over seeds, lines 95 % intervals, Welch's for differences. Seeds train side by side, unlike those above.
+GARA here is STAR without its Tutor, with a longer horizon and no
+[tilt penalty](notebook/departures.md#tutor-and-controller).
 {f"Not measured: {missing}." if missing else ""}
 
 ![Success of STAR and GARA over env steps](images/results_curves.png)
 
-Curves are means over seeds; bands hold all seeds. In the labyrinth STAR has a
-[tilt penalty](notebook/departures.md#tutor-and-controller), and GARA, which is better without, has none.
+Curves are means over seeds; bands hold all seeds.
 
 ## Worth of refinement
 
@@ -230,27 +249,10 @@ The last pair starts from four boxes that follow no wall. If the first boxes fol
 
 ![Success in the labyrinth as parts of STAR are left out](images/results_parts.png)
 
-In the labyrinth the variants are of an older agent without tilt penalty, after 61 M env steps. STAR is newer and had
-90 M; of the same age it had .87. A grid of 6 x 6, the only size tried, learns
-[faster](notebook/results.md#what-each-part-is-worth) than STAR.
+The variants of the labyrinth are older, without tilt penalty, after 61 M env steps. STAR had 90 M; of their age it had
+.87. A grid of 6 x 6, the only size tried, learns [faster](notebook/results.md#what-each-part-is-worth).
 
-## Other learners
-
-[SGIM beside STAR alone](sgim.md#what-it-does-there), [SGIM-SAHT in worlds](saht.md) and [tutors of simulated
-students](tutoring.md) have their figures on their own pages.
-
-## Measure a row again
-
-```bash
-python scripts/results/reproduce.py ant_maze/one_by_one/star ant_labyrinth/gara  # GPU
-python scripts/results/page.py --digests
-```
-
-The first command goes on where it was interrupted. A row holds its seeds, command, commit, device, versions and
-*learning digest*: how far three tiny epochs of its config move the agent. The digest tells whether the code of today
-learns as the measured code did. `results/README.md` lists all raw figures. Earlier measurements and attempts are in the
-[notebook](notebook/results.md).
-"""
+{LAST}"""
 
 
 def _age(older: int, count: int) -> str:

@@ -175,18 +175,15 @@ def refine(
     met = reached(goals, cube)
 
     def one_pair(abstraction: Abstraction, graph: Graph, pair_key: Array) -> tuple[Abstraction, Graph, tuple]:
-        region, target, found = _most_urgent(config, abstraction, graph, weight)
+        region, target = _most_urgent(config, abstraction, graph, weight)
         inside = region == target
         goal_key, cut_key = jax.random.split(pair_key)
-        commanded, wanted, there = _boxes(abstraction, region, target, goals, met, cube=cube, key=goal_key)
-        judged = found & there
+        commanded, wanted, judged = _boxes(abstraction, region, target, goals, met, cube=cube, key=goal_key)
         leaves = _examine(config, abstraction, model, region, commanded, wanted, periods.start, periods.weight)
         verdict = reachability.summary(leaves)
         graph = graph.replace(
-            age=graph.age.at[region, target].set(jnp.where(found, 0, graph.age[region, target])),
-            transitions=graph.transitions.at[region, target].multiply(
-                jnp.where(found, jnp.where(inside, 0.5, 0.0), 1.0)  # another goal may be drawn
-            ),
+            age=graph.age.at[region, target].set(0),
+            transitions=graph.transitions.at[region, target].multiply(0.5 * inside),  # another goal may be drawn
         )
         mixed = judged & (verdict == MIXED)
         near = inside | regions.adjacent(abstraction)[region, target] | (not config.refinement.neighbours)
@@ -196,13 +193,13 @@ def refine(
         settled = judged & ~inside & recorded
         known = jnp.where(settled, verdict, graph.verdict[region, target])
         graph = graph.replace(verdict=graph.verdict.at[region, target].set(known))
-        return abstraction, graph, (splits, found, mixed)
+        return abstraction, graph, (splits, mixed)
 
-    abstraction, graph, (splits, found, mixed) = _each_due(config, abstraction, graph, one_pair, key=key)
+    examined, abstraction, graph, (splits, mixed) = _each_due(config, abstraction, graph, one_pair, key=key)
     abstraction, graph, more = _separate(config, abstraction, graph, periods, goals, met)
     splits = jax.tree.map(lambda x, other: jnp.concatenate([x.reshape(-1), other]), splits, more)
     metrics = {
-        "examined": found.sum(),
+        "examined": examined,
         "mixed": mixed.sum(),
         "splits": splits.done.sum(),
         "separated": more.done.sum(),
@@ -215,8 +212,11 @@ def refine(
 
 def _each_due(
     config: Settings, abstraction: Abstraction, graph: Graph, one_pair: Callable[..., Any], *, key: Array
-) -> tuple[Abstraction, Graph, Any]:
-    """Do `one_pair` as long as a pair is due, `pairs_per_epoch` times at most; its results, 0 where it was not done."""
+) -> tuple[Int[Array, ""], Abstraction, Graph, Any]:
+    """Do `one_pair` as long as a pair is due, `pairs_per_epoch` times at most: how often, and all that it returned.
+
+    Its other results have a leading axis of `pairs_per_epoch`, with 0 where it was not done.
+    """
     pairs = config.refinement.pairs_per_epoch
     keys = jax.random.split(key, pairs)
     shapes = jax.eval_shape(one_pair, abstraction, graph, keys[0])[2]
@@ -231,7 +231,7 @@ def _each_due(
         abstraction, graph, more = one_pair(abstraction, graph, keys[number])
         return number + 1, abstraction, graph, jax.tree.map(lambda all_, x: all_.at[number].set(x), told, more)
 
-    return jax.lax.while_loop(goes_on, one, (0, abstraction, graph, nothing))[1:]
+    return jax.lax.while_loop(goes_on, one, (jnp.zeros((), jnp.int32), abstraction, graph, nothing))
 
 
 def _separate(
@@ -256,12 +256,12 @@ def _separate(
 
 def _most_urgent(
     config: Settings, abstraction: Abstraction, graph: Graph, weight: Float[Array, "R"] | float
-) -> tuple[Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
-    """The pair to examine next, region and target, and whether any is due."""
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """The pair to examine next, region and target, of those that are due."""
     waiting = due(config, graph, abstraction.active)
     urgency = graph.transitions * (1 + graph.age) * weight
     region, target = jnp.unravel_index(jnp.argmax(jnp.where(waiting, urgency, -1.0)), waiting.shape)
-    return region, target, waiting[region, target]
+    return region, target
 
 
 def _split(

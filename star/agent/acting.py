@@ -207,11 +207,16 @@ class TrainedAgent:
 
 def load(run_dir: Path, *, checkpoint: str = "last", seed: int | None = None) -> TrainedAgent:
     """The agent of `seed` (None: the first) in a checkpoint of a run; raises `UserError`, as `star.load` does."""
+    program, number, state, env_steps = read(run_dir, checkpoint=checkpoint, seed=seed)
+    return TrainedAgent(program, state, run_dir=run_dir, env_steps=env_steps, seed=program.seeds[number])
+
+
+def read(run_dir: Path, *, checkpoint: str, seed: int | None) -> tuple[Program, int, TrainState, int]:
+    """The program of a run, and of the agent that `load` gives its number there, its state and its env steps."""
     program = programs.build(load_to_act(run_dir, {}))
     number = saved.agent_number(program.seeds, run_dir, seed)
     env_steps, states = saved.load_state(program, run_dir, checkpoint)
-    state = saved.of_one(states, number)
-    return TrainedAgent(program, state, run_dir=run_dir, env_steps=env_steps, seed=program.seeds[number])
+    return program, number, saved.of_one(states, number), env_steps
 
 
 @partial(jax.jit, static_argnames="spec")  # agents of one kind share it

@@ -158,15 +158,14 @@ def experience(
     A period in which success ends the episode counts as if the agent had stayed at the goal for the rest of it.
     """
     worthy = worth(section, segment.distance, segment.success)
-    last = jnp.sum(worthy * jnp.maximum(segment.terminated, segment.arrived) * segment.alive, axis=0)
-    arrived = jnp.max(segment.arrived * segment.alive, axis=0)
-    stays = arrived * (section.period - memory.clock - segment.alive.sum(axis=0))  # env steps
+    last = jnp.sum(worthy * segment.terminated * segment.alive, axis=0)
+    arrived = segment.arrived * segment.alive
+    left = section.period - memory.clock - segment.alive.sum(axis=0)  # env steps of the period
     memory = tick(section, memory, steps=len(segment.alive))
-    reward = accumulate(section, memory.reward, worthy, segment.alive)
-    memory = memory.replace(reward=reward if section.reward == "max" else reward + stays * last / section.period)
+    memory = memory.replace(reward=accumulate(section, memory.reward, worthy, segment.alive + arrived * left))
     end, lost = task.spec.abstract(segment.obs[-1]), segment.lost
     early = jnp.maximum(segment.ended[-1], lost)  # what is lost in the last step of an episode has not `ended` early
-    weight = jnp.maximum(jnp.where(memory.clock == 0, segment.alive[-1] * (1 - early), 0.0), arrived)
+    weight = jnp.maximum(jnp.where(memory.clock == 0, segment.alive[-1] * (1 - early), 0.0), arrived.max(axis=0))
     if marks.own is not None:  # random subgoals tell nothing of where commands lead
         weight, lost = weight * marks.own, lost * marks.own
     decision = Decision(
@@ -281,7 +280,7 @@ def accumulate(
     external: Float[Array, "l B"],
     alive: Float[Array, "l B"],
 ) -> Float[Array, "B"]:
-    """The reward of periods so far, after l more env steps with rewards `external`; `alive` masks ended ones.
+    """The reward of periods so far, after l more env steps with rewards `external`, each as often as `alive` says.
 
     The maximum is the same whether the agent stays at the goal or leaves it again; the mean tells them apart.
     """

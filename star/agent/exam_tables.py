@@ -47,17 +47,19 @@ def evaluations(rows: Sequence[Row]) -> Table:
     """A line for each seed of each checkpoint, and one for all seeds where there are several."""
     table = Table(title=_title(rows), box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     about = _telling(rows)
+    counted = ["episodes"] if _episodes(rows) is None else []
     for name in about:
         table.add_column(name, overflow="fold")
-    for name in ("env steps", "seed", *MEASURES, "s to\ngoal", "m to\ngoal", "SPL", "stayed", "end\ndistance"):
+    measured = ("s to\ngoal", "m to\ngoal", "SPL", "stayed", "end\ndistance")
+    for name in ("env steps", "seed", *counted, *MEASURES, *measured):
         table.add_column(name, justify="right")
     for row in rows:
         begin: list[Text | str] = [*(Text(row[name]) for name in about), f"{row['env_steps']:,}"]
         for seed in row["seeds"]:
-            table.add_row(*begin, str(seed["seed"]), *_cells(seed))
+            table.add_row(*begin, str(seed["seed"]), *(str(seed[name]) for name in counted), *_cells(seed))
         if len(row["seeds"]) > 1:
             over = {f"{name}_interval": row[f"{name}_seeds_interval"] for name in MEASURES}
-            table.add_row(*begin, "all", *_cells({**row, **over}))
+            table.add_row(*begin, "all", *(str(row[name]) for name in counted), *_cells({**row, **over}))
     return table
 
 
@@ -128,8 +130,15 @@ def _title(rows: Sequence[Row]) -> str:
     kind, _, side = rows[0]["goals"].partition(" ")
     goals = f"goals on a grid of {side} x {side}" if side else {"test": "test goals", "train": "training goals"}[kind]
     tasks = dict.fromkeys(f"{row['env']} ({row['engine']})" for row in rows)
-    episodes = rows[0]["seeds"][0]["episodes"]
-    return f"{', '.join(tasks)}: {goals}, {episodes:,} episodes a seed, 95 % intervals"
+    episodes = _episodes(rows)
+    told = "" if episodes is None else f"{episodes:,} episodes a seed, "
+    return f"{', '.join(tasks)}: {goals}, {told}95 % intervals"
+
+
+def _episodes(rows: Sequence[Row]) -> int | None:
+    """The number of episodes of each seed; None if seeds differ in it."""
+    found = {seed["episodes"] for row in rows for seed in row["seeds"]}
+    return found.pop() if len(found) == 1 else None
 
 
 def _cells(row: Row) -> list[str]:

@@ -61,16 +61,23 @@ def test_a_table_names_runs_as_they_are_called(capsys):
 def test_a_table_of_seeds_fits_into_100_columns_and_the_rest_is_told_below(capsys):
     row = evaluation("a", env_steps=90_000_000)
     over = {f"{name}_seeds_interval": [0.1, 1.0] for name in ("success_any", "success_final")}
-    over |= {
-        f"{name}_above": {"seeds": 1, "of": 2, "interval": [0.01, 0.99]} for name in ("success_any", "success_final")
-    }
+    above = {"seeds": 1, "of": 2, "interval": [0.01, 0.99]}
+    over |= dict.fromkeys(("success_any_above", "success_final_above"), above)
     seeds = [row["seeds"][0], row["seeds"][0] | {"seed": 4, "failed": []}]
     exam_tables.show([row | over | {"seeds": seeds}], None, again="")
-    table, _, below = capsys.readouterr().out.partition(
-        "seed 3: fails in episodes 2, 5, 6, ... (3 stuck, 1 out of time)\n"
-    )
+    failed = "seed 3: fails in episodes 2, 5, 6, ... (3 stuck, 1 out of time)\n"
+    table, _, below = capsys.readouterr().out.partition(failed)
     assert "8 episodes a seed" in table and max(map(len, table.splitlines())) <= 100
     assert "seed 4" not in below and "seeds above 0.9: success_any 1 of 2 [0.01, 0.99], success_final 1 of 2" in below
+
+
+def test_runs_that_played_other_numbers_of_episodes_have_a_column_of_them(capsys):
+    one, other = (evaluation(name, env_steps=10) for name in "ab")
+    other = other | {"episodes": 500, "seeds": [other["seeds"][0] | {"episodes": 500}]}
+    exam_tables.show([one, other], None, again="")
+    shown = capsys.readouterr().out
+    assert "episodes a seed" not in shown and " episodes " in shown
+    assert [line.split()[2:4] for line in shown.splitlines() if "[0.250" in line] == [["3", "8"], ["3", "500"]]
 
 
 def test_a_run_never_writes_over_another(capsys, folder):
@@ -172,7 +179,11 @@ def test_evaluate_prints_a_line_for_each_seed_and_how_to_watch_a_failure(calls, 
         main("evaluate runs/old --episodes 7 --checkpoint best --evaluation-seed 4 --env.options.cell 4".split()) == 0
     )
     out = capsys.readouterr().out
-    assert "3 0.500 [0.250, 0.750] 0.500 [0.250, 0.750] 7.0 7.0 - 7.00 7.00 seed 3: fails in" in " ".join(out.split())
+    assert (
+        "3 0.500 [0.250, 0.750] 0.500 [0.250, 0.750] 7.0 7.0 - 7.00 7.00 seed 3: fails in episodes 2, 5, 6, ..."
+        in " ".join(out.split())
+    )
+    assert "8 episodes a seed" in out
     again = "--run runs/old --checkpoint 10 --seed 3 --episode 2 --evaluation-seed 4 --episodes 7 --env.options.cell 4"
     assert f"star render {again} --out failure.html" in out
     (call,) = calls

@@ -184,6 +184,7 @@ def test_a_step_that_is_not_finite_is_not_made_and_truncates():
     np.testing.assert_array_equal(states.metrics["non_finite"], [0, 0, 1, 0])
     np.testing.assert_array_equal(states.done, [0, 0, 1, 1])
     np.testing.assert_array_equal(states.info["truncation"], [0, 0, 1, 1])
+    assert np.isfinite(states.reward).all()
     assert (states.reward[:2] != 0).all() and (states.reward[2:] == 0).all()  # nothing was done for more
 
 

@@ -19,12 +19,9 @@ def _choose(mode, q, reaches, misses, count, epsilon, key):
     allowed = successors(mode, reaches=reaches, misses=misses, active=active)
     where, goal = jax.random.randint(key, (2, B), 0, count)
     state = CommanderState(q=q, chosen=jnp.zeros(R))
-    return (
-        allowed,
-        where,
-        goal,
-        values.choose(state, allowed, where, goal, practised=where * 0 - 1, epsilon=epsilon, key=key),
-    )
+    nobody = jnp.full(B, -1)
+    chosen = values.choose(state, allowed, where, goal, practised=nobody, epsilon=epsilon, key=key)
+    return allowed, where, goal, chosen
 
 
 choose = jax.jit(_choose, static_argnums=0)

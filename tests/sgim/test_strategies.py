@@ -294,10 +294,8 @@ def drawn(allowed, attraction, *, where, n=4000):
     state = CommanderState(q=np.zeros((5, 5, 5), np.float32), chosen=np.zeros(5, np.float32))
     both, here = Successors(allowed, allowed), np.full(n, where)
     attraction, key = np.float32(attraction), jax.random.key(0)
-    return np.bincount(
-        choose(state, both, here, here, practised=here * 0 - 1, attraction=attraction, epsilon=1.0, key=key),
-        minlength=5,
-    )
+    found = choose(state, both, here, here, practised=np.full(n, -1), attraction=attraction, epsilon=1.0, key=key)
+    return np.bincount(found, minlength=5)
 
 
 def test_random_targets_follow_their_attraction():
