@@ -118,12 +118,9 @@ def train(
     def loss(params: Any, step_key: Array) -> Array:
         return _loss(config, params, state.space, replay.sample(state.ring, step_key, batch_size=config.batch_size))
 
+    rate, updates = config.learning_rate, config.updates_per_epoch
     params, optimizer, mean_loss = descend(
-        loss,
-        state.params,
-        state.optimizer,
-        learning_rate=config.learning_rate,
-        keys=jax.random.split(key, config.updates_per_epoch),
+        loss, state.params, state.optimizer, learning_rate=rate, updates=updates, key=key
     )
     return state.replace(params=params, optimizer=optimizer), {"loss": mean_loss}
 

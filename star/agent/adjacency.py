@@ -108,12 +108,9 @@ def train(
         known = visited.any()
         return _loss(config, params, centre[anchor], centre[near], centre[far], others.any(axis=1), known)
 
+    rate, updates = config.learning_rate, config.updates_per_epoch
     params, optimizer, mean_loss = descend(
-        loss,
-        state.params,
-        state.optimizer,
-        learning_rate=config.learning_rate,
-        keys=jax.random.split(key, config.updates_per_epoch),
+        loss, state.params, state.optimizer, learning_rate=rate, updates=updates, key=key
     )
     share = state.adjacent.sum() / jnp.maximum(jnp.square(visited.sum()), 1)
     return state.replace(params=params, optimizer=optimizer), {"loss": mean_loss, "share": share}

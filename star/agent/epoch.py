@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,16 @@ Metrics = dict[str, Array]
 Carry = tuple[TrainState, Streams]
 
 
+class _Fixed(NamedTuple):
+    """All that an epoch does not change."""
+
+    agent: Agent
+    env: VectorEnv
+    teachers: Sequence[Demonstrations]
+    roadmap: Roadmap
+    env_steps: Float[Array, ""]
+
+
 def epoch(
     config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, teachers: Sequence[Demonstrations] = ()
 ) -> tuple[TrainState, Metrics]:
@@ -58,7 +68,7 @@ def epoch(
     segments = spec.episode_length // config.tutor.period
     blocks = (segments // config.tutor.unroll, config.tutor.unroll)
     (state, streams), (finished, metrics, counts) = jax.lax.scan(
-        partial(_block, agent, env, teachers, roadmap, env_steps),
+        partial(_block, _Fixed(agent, env, teachers, roadmap, env_steps)),
         (state, streams),
         (jax.random.split(scan_key, blocks[0]), jnp.arange(segments).reshape(blocks)),
     )
@@ -85,20 +95,12 @@ def epoch(
     return state.replace(epoch=state.epoch + 1), metrics | more
 
 
-def _block(
-    agent: Agent,
-    env: VectorEnv,
-    teachers: Sequence[Demonstrations],
-    roadmap: Roadmap,
-    env_steps: Float[Array, ""],
-    carry: Carry,
-    inputs: tuple[Array, Array],
-) -> tuple[Carry, tuple[Any, Metrics, Metrics]]:
+def _block(fixed: _Fixed, carry: Carry, inputs: tuple[Array, Array]) -> tuple[Carry, tuple[Any, Metrics, Metrics]]:
     """`tutor.unroll` segments, whose numbers are given, then one update of the Tutor."""
-    config, task = agent.config, agent.task
+    agent, config, task = fixed.agent, fixed.agent.config, fixed.agent.task
     scan_key, update_key = jax.random.split(inputs[0])
     (state, streams), (decisions, led, finished, metrics, counts) = jax.lax.scan(
-        partial(_segment, agent, env, teachers, roadmap, env_steps),
+        partial(_segment, fixed),
         carry,
         (jax.random.split(scan_key, config.tutor.unroll), inputs[1]),
     )
@@ -117,15 +119,10 @@ def _block(
 
 
 def _segment(
-    agent: Agent,
-    env: VectorEnv,
-    teachers: Sequence[Demonstrations],
-    roadmap: Roadmap,
-    env_steps: Float[Array, ""],
-    carry: Carry,
-    inputs: tuple[Array, Array],
+    fixed: _Fixed, carry: Carry, inputs: tuple[Array, Array]
 ) -> tuple[Carry, tuple[Any, Any, Any, Metrics, Metrics]]:
     """One decision of the Tutor: command, act, let Controller and Commander learn."""
+    agent, env, teachers, roadmap, env_steps = fixed
     config, task, (state, streams), (key, number) = agent.config, agent.task, carry, inputs
     command_key, tutor_key, rollout_key, update_key, reset_key, imitation_key = jax.random.split(key, 6)
     streams, passed, marks = play.segment(

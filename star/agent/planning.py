@@ -44,12 +44,7 @@ def init(*, regions: int) -> Model:
 
 
 def observe(
-    section: CommanderConfig,
-    state: CommanderState,
-    roadmap: Roadmap,
-    batch: Decision,
-    *,
-    margin: Float[Array, ""] | float = 0.0,
+    section: CommanderConfig, state: CommanderState, roadmap: Roadmap, batch: Decision, *, margin: Array | float = 0.0
 ) -> CommanderState:
     """Count what the streams decided at one instant; teachers count like all others."""
     return state.replace(model=_counted(_model(state), batch, cells=batch))

@@ -28,12 +28,7 @@ def init(*, regions: int) -> None:
 
 
 def observe(
-    section: CommanderConfig,
-    state: CommanderState,
-    roadmap: Roadmap,
-    batch: Decision,
-    *,
-    margin: Float[Array, ""] | float = 0.0,
+    section: CommanderConfig, state: CommanderState, roadmap: Roadmap, batch: Decision, *, margin: Array | float = 0.0
 ) -> CommanderState:
     """A step on what the streams decided at one instant; what a teacher chose rises to `margin` above all else."""
     error = td_error(section, state, roadmap.allowed, batch)

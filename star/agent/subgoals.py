@@ -44,11 +44,7 @@ class Points(NamedTuple):
         return way
 
     def demonstrated(
-        self,
-        spec: Spec,
-        state: Float[Array, "M state"],
-        later: Float[Array, "M state"],
-        outcome: Float[Array, "M d"],
+        self, spec: Spec, state: Float[Array, "M state"], later: Float[Array, "M state"], outcome: Float[Array, "M d"]
     ) -> Float[Array, "M p"]:
         """The subgoal of who came from `state` to the state `later`, on the way to `outcome`."""
         return spec.pose(later) - spec.pose(state)
@@ -84,11 +80,7 @@ class Boxes(NamedTuple):
         return Box.around(way, self.margin).corners
 
     def demonstrated(
-        self,
-        spec: Spec,
-        state: Float[Array, "M state"],
-        later: Float[Array, "M state"],
-        outcome: Float[Array, "M d"],
+        self, spec: Spec, state: Float[Array, "M state"], later: Float[Array, "M state"], outcome: Float[Array, "M d"]
     ) -> Float[Array, "M m"]:
         """The box around the `outcome` of who was in `state`."""
         return self.asking(outcome - spec.abstract(state))

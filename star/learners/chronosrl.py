@@ -30,7 +30,7 @@ from star.learners import futures, replay, squashed
 from star.learners.futures import Future, ReplayState, ahead
 from star.learners.networks import ResidualMLP, apply, distance, uniform_dense
 from star.learners.protocol import Learner
-from star.learners.replay import Imitation, Penalty, Relabel, Transition, weighted_mean
+from star.learners.replay import Imitation, Transition, weighted_mean
 from star.learners.sections import ChronoSRLConfig
 
 Metrics = dict[str, Array]
@@ -193,24 +193,6 @@ def _policy(config: ChronoSRLConfig, params: Any, obs: Array) -> tuple[Array, Ar
     return squashed.moments(apply(_actor(config, params["params"]["out"]["bias"].shape[-1]), params, obs))
 
 
-def update(
-    config: ChronoSRLConfig,
-    state: ReplayState,
-    rollout: Transition,
-    *,
-    relabel: Relabel | None = None,
-    penalty: Penalty | None = None,
-    imitation: Imitation | None = None,
-    key: Array,
-) -> tuple[ReplayState, Metrics]:
-    """Store one rollout [T, B] and make `updates_per_rollout` updates; the actor also learns from `imitation`.
-
-    Goals of the future take the place of `relabel`, and only a Tutor has a `penalty`.
-    """
-    one = partial(_one_update, config, imitation)
-    return futures.learn(one, state, _step(rollout), least=_least(config), updates=config.updates_per_rollout, key=key)
-
-
 def _least(config: ChronoSRLConfig) -> int:
     """The number of steps of the same episode that follow the first one of a chunk, at least."""
     return max(1, config.action_chunk - 1)
@@ -313,4 +295,6 @@ def _actor_loss(
     return loss, told | {"actor_loss": loss, "entropy": -weighted_mean(log_prob, batch.weight)}
 
 
-LEARNER = Learner(Config=ChronoSRLConfig, init=init, act=act, update=update)
+LEARNER = Learner(
+    Config=ChronoSRLConfig, init=init, act=act, update=futures.updating(_one_update, step=_step, least=_least)
+)

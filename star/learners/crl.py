@@ -26,7 +26,7 @@ from star.learners import futures, replay, squashed
 from star.learners.futures import Future, ReplayState, Step, ahead
 from star.learners.networks import MLP, VARIANCE, apply, distance
 from star.learners.protocol import Learner
-from star.learners.replay import Imitation, Penalty, Relabel, Transition, weighted_mean
+from star.learners.replay import Imitation, Transition, weighted_mean
 from star.learners.sections import CRLConfig
 
 Metrics = dict[str, Array]
@@ -65,24 +65,6 @@ def _policy(config: CRLConfig, params: Any, obs: Array) -> tuple[Array, Array]:
     """Mean and deviation of actions before tanh."""
     size = params["params"][f"Dense_{len(config.hidden)}"]["bias"].shape[-1]
     return squashed.moments(apply(_mlp(config, size), params, obs))
-
-
-def update(
-    config: CRLConfig,
-    state: ReplayState,
-    rollout: Transition,
-    *,
-    relabel: Relabel | None = None,
-    penalty: Penalty | None = None,
-    imitation: Imitation | None = None,
-    key: Array,
-) -> tuple[ReplayState, Metrics]:
-    """Store one rollout [T, B] and make `updates_per_rollout` updates; the actor also learns from `imitation`.
-
-    Goals of the future take the place of `relabel`, and only a Tutor has a `penalty`.
-    """
-    one = partial(_one_update, config, imitation)
-    return futures.learn(one, state, Step.of(rollout), updates=config.updates_per_rollout, key=key)
 
 
 def _drawn(config: CRLConfig, ring: replay.Ring, future: Future, key: Array) -> tuple[Step, Float[Array, "N k"]]:
@@ -149,4 +131,4 @@ def _actor_loss(
     return loss, {"actor_loss": loss, "entropy": -weighted_mean(log_prob, batch.weight)}
 
 
-LEARNER = Learner(Config=CRLConfig, init=init, act=act, update=update)
+LEARNER = Learner(Config=CRLConfig, init=init, act=act, update=futures.updating(_one_update))

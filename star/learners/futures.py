@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 from star import devices
 from star.learners import replay
 from star.learners.networks import adam_step
-from star.learners.replay import Track, Transition, flatten
+from star.learners.replay import Imitation, Penalty, Relabel, Track, Transition, flatten
 
 Metrics = dict[str, Array]
 
@@ -124,21 +124,35 @@ def ahead(left: Int[Array, "*n"], uniform: Float[Array, "*n"], *, discount: Arra
     return jnp.minimum(steps, left)
 
 
-def learn(
-    one_update: Callable[[Future, ReplayState, Array], tuple[ReplayState, Metrics]],
-    state: ReplayState,
-    rollout: Step,
+def updating(
+    one_update: Callable[..., tuple[ReplayState, Metrics]],
     *,
-    least: int = 1,
-    updates: int,
-    key: Array,
-) -> tuple[ReplayState, Metrics]:
-    """Store the steps [T, B] of a rollout and make so many `updates`; metrics are means over them.
+    step: Callable[[Transition], Step] = Step.of,
+    least: Callable[[Any], int] = lambda config: 1,
+) -> Callable[..., tuple[ReplayState, Metrics]]:
+    """The `update` of a `Learner`: it stores the steps of a rollout [T, B], and makes `updates_per_rollout` updates.
 
-    Each is `one_update(future, state, key)` on items that at least `least` others follow.
+    Each is `one_update(config, imitation, future, state, key)`, on items that at least `least(config)` others follow.
+    `step` is the part of a transition that is stored. Metrics are means over the updates.
     """
-    rollout = devices.whole(rollout)
-    ring = replay.add(state.ring, flatten(rollout))
-    future = Future.of(ring, num_envs=rollout.weight.shape[1], least=least)
-    state, metrics = jax.lax.scan(partial(one_update, future), state.replace(ring=ring), jax.random.split(key, updates))
-    return state, jax.tree.map(jnp.mean, metrics)
+
+    def update(
+        config: Any,
+        state: ReplayState,
+        rollout: Transition,
+        *,
+        relabel: Relabel | None = None,
+        penalty: Penalty | None = None,
+        imitation: Imitation | None = None,
+        key: Array,
+    ) -> tuple[ReplayState, Metrics]:
+        """Goals of the future take the place of `relabel`, and only a Tutor has a `penalty`."""
+        steps = devices.whole(step(rollout))
+        ring = replay.add(state.ring, flatten(steps))
+        future = Future.of(ring, num_envs=steps.weight.shape[1], least=least(config))
+        one = partial(one_update, config, imitation, future)
+        keys = jax.random.split(key, config.updates_per_rollout)
+        state, metrics = jax.lax.scan(one, state.replace(ring=ring), keys)
+        return state, jax.tree.map(jnp.mean, metrics)
+
+    return update

@@ -98,9 +98,10 @@ def descend(
     optimizer: optax.OptState,
     *,
     learning_rate: float | Array,
-    keys: Array,
+    updates: int,
+    key: Array,
 ) -> tuple[Any, optax.OptState, Float[Array, ""]]:
-    """One Adam step on `loss(params, key)` for each of `keys`: params, state of the optimiser, and the mean loss."""
+    """So many Adam steps on `loss(params, key)`: params, state of the optimiser, and the mean loss."""
 
     def step(carry: tuple, key: Array) -> tuple[tuple, Array]:
         params, optimizer = carry
@@ -108,7 +109,7 @@ def descend(
         change, optimizer = optax.scale_by_adam().update(gradient, optimizer)
         return (jax.tree.map(lambda p, c: p - learning_rate * c, params, change), optimizer), value
 
-    (params, optimizer), losses = jax.lax.scan(step, (params, optimizer), keys)
+    (params, optimizer), losses = jax.lax.scan(step, (params, optimizer), jax.random.split(key, updates))
     return params, optimizer, losses.mean()
 
 

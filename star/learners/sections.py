@@ -15,6 +15,13 @@ from star.learners.protocol import Learner, LearnerConfig, Rollout
 NUMBER = 4  # bytes
 BUILT_IN = ("ppo", "td3")
 OF_PLACES = ("crl", "chronosrl")  # of a level that is sent to places
+DISCOUNT: Any = setting(
+    0.95,
+    "A reward counts by this factor less for each decision of the level that it lies ahead (gamma).",
+    unit="",
+    ge=0,
+    le=1,
+)
 
 
 def one_of(*names: str) -> Any:
@@ -32,13 +39,7 @@ class PPOConfig(LearnerConfig):
     )
     max_learning_rate: float = setting(1e-3, "The adaptive step size never exceeds this.", unit="", gt=0)
     target_kl: float = setting(0.016, "The step size aims at this KL divergence per pass.", unit="nats", gt=0)
-    discount: float = setting(
-        0.95,
-        "A reward counts by this factor less for each decision of the level that it lies ahead (gamma).",
-        unit="",
-        ge=0,
-        le=1,
-    )
+    discount: float = DISCOUNT
     gae_lambda: float = setting(0.95, "Generalised advantage estimation uses this lambda.", unit="", ge=0, le=1)
     clip: float = setting(0.2, "The probability ratio is clipped to 1 plus or minus this.", unit="", gt=0)
     entropy: float = setting(0.0, "The entropy bonus has this weight in the loss.", unit="", ge=0)
@@ -104,13 +105,7 @@ class TD3Config(ReplayConfig):
     hidden: Hidden = setting((300, 300), "Actor and critics have layers of these widths.", unit="units")
     actor_learning_rate: float = setting(1e-4, "Adam takes steps of this size for the actor.", unit="", gt=0)
     critic_learning_rate: float = setting(1e-3, "Adam takes steps of this size for the critics.", unit="", gt=0)
-    discount: float = setting(
-        0.95,
-        "A reward counts by this factor less for each decision of the level that it lies ahead (gamma).",
-        unit="",
-        ge=0,
-        le=1,
-    )
+    discount: float = DISCOUNT
     tau: float = setting(
         0.005, "Target networks move by this share of the difference after each update.", unit="", gt=0, le=1
     )
