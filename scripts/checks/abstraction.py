@@ -56,7 +56,8 @@ def rollouts(
     active = state.abstraction.active[:, None] & state.abstraction.active[None, :]
     chosen = jnp.where(pairs.any(axis=1, keepdims=True), pairs, active)
     roadmap = Roadmap.of(section, state.abstraction, state.graph)
-    roadmap = roadmap.replace(allowed=Successors(greedy=active, explore=chosen))
+    near = roadmap.allowed.near
+    roadmap = roadmap.replace(allowed=Successors(near, greedy=near.pairs(active), explore=near.pairs(chosen)))
     never = jnp.zeros(())
 
     def segment(streams: play.Streams, key: jax.Array) -> tuple[play.Streams, Any]:

@@ -68,8 +68,8 @@ class Plan:
         state, roadmap = jax.jit(lambda state: hierarchy.prepare(agent, state))(state)
         self.abstraction = state.abstraction
         self.count = int(state.abstraction.count)
-        self.q, self.allowed = np.asarray(state.commander.q), np.asarray(roadmap.allowed.greedy)
-        self.values = np.asarray(values.best(state.commander.q, roadmap.allowed.greedy))
+        self.q, self.allowed = jax.device_get((state.commander.q, roadmap.allowed))
+        self.values = np.asarray(values.best(state.commander.q, roadmap.allowed))
         self.led = None if state.commander.model is None else np.asarray(state.commander.model.led)
 
     def region(self, point: np.ndarray) -> int:
@@ -106,15 +106,18 @@ def periods(told: Told, plan: Plan, *, period: int, every: int) -> tuple[list[st
 
 def commands(plan: Plan, region: int, goal_region: int, number: int) -> list[str]:
     """A line for each of the best commands of a region, for a goal in `goal_region`."""
-    (possible,) = values.targets(plan.allowed, np.array([region]), np.array([goal_region]))
+    near = plan.allowed.near.region[region]
+    (possible,) = values.targets(plan.allowed.near, plan.allowed.greedy, np.array([region]), np.array([goal_region]))
     worth = np.where(possible, plan.q[region, goal_region], -np.inf)
     lines = []
-    for target in np.argsort(-worth)[: min(number, plan.count)]:
-        line = f"  {target} {plan.box(target)}: value {worth[target]:.3f}"
+    for place in np.argsort(-worth)[: min(number, plan.count)]:
+        line = f"  {near[place]} {plan.box(near[place])}: value {worth[place]:.3f}"
         if plan.led is not None:
-            led = plan.led[int(target == goal_region), region, target]
+            led = plan.led[int(near[place] == goal_region), region, place]
             ends = [
-                f"{j}: {led[j]:.1f}, {plan.values[j, goal_region]:.3f}" for j in np.argsort(-led)[:LED] if led[j] > 0
+                f"{near[j]}: {led[j]:.1f}, {plan.values[near[j], goal_region]:.3f}"
+                for j in np.argsort(-led)[:LED]
+                if led[j] > 0
             ]
             line += f", number {led.sum():.1f}, led ({'; '.join(ends)})"
         lines.append(line)

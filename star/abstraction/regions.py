@@ -19,10 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 from numpy.typing import ArrayLike
 
 from envs.common import modes
+
+_CENTRES = 1e-3  # weight of the way between centres against the gap between boxes
 
 
 class Abstraction(struct.PyTreeNode):
@@ -110,6 +112,59 @@ class Box(struct.PyTreeNode):
     def seen_from(self, origin: Float[Array, "*batch d"]) -> Box:
         """The box relative to `origin`."""
         return Box(lower=self.lower - origin, upper=self.upper - origin)
+
+
+class Near(struct.PyTreeNode):
+    """The S regions near each one, itself included: tables of pairs have a place for each of them, and no others."""
+
+    region: Int[Array, "R S"]
+    """In ascending order."""
+    place: Int[Array, "R R"]
+    """Of each region (column) in the list of another (row); S, which is beyond a table, where it is not near."""
+
+    @classmethod
+    def of(cls, region: Int[Array, "R S"]) -> Near:
+        """With these lists."""
+        capacity, size = region.shape
+        rows = jnp.arange(capacity)
+        places = jnp.full((capacity, capacity), size, jnp.int32)
+        return cls(region=region, place=places.at[rows[:, None], region].set(jnp.arange(size)))
+
+    @classmethod
+    def every(cls, capacity: int) -> Near:
+        """All regions are near each other."""
+        return cls.of(jnp.broadcast_to(jnp.arange(capacity), (capacity, capacity)))
+
+    @property
+    def own(self) -> Int[Array, "R"]:
+        """The place of each region in its own list."""
+        return jnp.diagonal(self.place)
+
+    def pairs(self, table: Shaped[Array, "R R"]) -> Shaped[Array, "R S"]:
+        """What a table of all pairs says of those that are near."""
+        return jnp.take_along_axis(table, self.region, axis=1)
+
+    def parts(self, earlier: Near, origin: Int[Array, "R"]) -> Int[Array, "R S"]:
+        """For each place of a table of today, that of what was cut (`origin`) in the `earlier` table."""
+        return earlier.place[origin[:, None], origin[self.region]]
+
+
+def near(abstraction: Abstraction, number: int | None) -> Near:
+    """So many nearest regions (None: all), by the gap between boxes, then between centres, in units of the space."""
+    capacity = abstraction.capacity
+    if number is None or number >= capacity:
+        return Near.every(capacity)
+    size = abstraction.space[1] - abstraction.space[0]
+    lower, upper = abstraction.lower / size, abstraction.upper / size
+    gap = jnp.maximum(lower[:, None] - upper, lower - upper[:, None])
+    between = (lower[:, None] + upper[:, None] - lower - upper) / 2
+    away = _length(jnp.maximum(gap, 0.0)) + _CENTRES * _length(between)
+    away = jnp.where(jnp.eye(capacity, dtype=bool), -1.0, jnp.where(abstraction.active, away, jnp.inf))
+    return Near.of(jnp.sort(jax.lax.top_k(-away, number)[1], axis=1))
+
+
+def _length(vector: Float[Array, "*n d"]) -> Float[Array, "*n"]:
+    return jnp.sqrt(jnp.square(vector).sum(axis=-1))
 
 
 def create(space: tuple[ArrayLike, ArrayLike], cuts: Sequence[Sequence[float]], *, max_regions: int) -> Abstraction:
@@ -205,6 +260,16 @@ def over_parts(table: Float[Array, "*R"], origin: Int[Array, "R"]) -> Float[Arra
     """Sums of `table` along all its axes, each of regions, over the parts of what a region was cut from (`origin`)."""
     cell = jnp.ix_(*[origin] * table.ndim)
     return jnp.zeros_like(table).at[cell].add(table)[cell]
+
+
+def moved(table: Array, places: Int[Array, "R S"], *, axis: int, rows: int = 0) -> Array:
+    """The `table` with the entries at these `places` of each row along `axis`, and 0 where they are beyond it.
+
+    `rows` is the axis of what the rows of `places` are about.
+    """
+    shape = [1] * table.ndim
+    shape[rows], shape[axis] = places.shape
+    return jnp.take_along_axis(table, places.reshape(shape), axis=axis, mode="fill", fill_value=0)
 
 
 def inherit(table: Array, origin: Int[Array, "R"], *, axes: Sequence[int] | None = None) -> Array:

@@ -49,8 +49,9 @@ def _rule(section: CommanderConfig) -> ModuleType:
 
 def init(section: CommanderConfig, *, regions: int) -> CommanderState:
     """Q = 0 everywhere, optimistic for rewards that are negative, and an empty model."""
-    model = _rule(section).init(regions=regions)
-    return CommanderState(q=jnp.zeros((regions, regions, regions)), chosen=jnp.zeros(regions), model=model)
+    near = min(regions, section.nearest or regions)
+    model = _rule(section).init(regions=regions, near=near)
+    return CommanderState(q=jnp.zeros((regions, regions, near)), chosen=jnp.zeros(regions), model=model)
 
 
 def epsilon(section: CommanderConfig, env_steps: Float[Array, ""] | float) -> Float[Array, ""]:
@@ -233,7 +234,9 @@ def follow(
     origin = change.origin
     parts = regions.over_parts(jnp.ones(len(origin)), origin)
     model = _rule(section).follow(section, state, change, known.model, finished, traffic)
-    return state.replace(q=regions.inherit(state.q, origin), chosen=state.chosen[origin] / parts, model=model)
+    then, now = (regions.near(table, section.nearest) for table in (change.before, change.after))
+    q = values.inherited(state.q, origin, then=then, now=now)
+    return state.replace(q=q, chosen=state.chosen[origin] / parts, model=model)
 
 
 def fade(section: CommanderConfig, state: CommanderState) -> CommanderState:

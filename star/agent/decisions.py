@@ -15,7 +15,7 @@ from envs.common.batching import where
 from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.refinement import Graph
-from star.abstraction.regions import Abstraction, Box
+from star.abstraction.regions import Abstraction, Box, Near
 from star.agent.sections import CommanderConfig
 from star.agent.task import Task
 
@@ -89,8 +89,10 @@ class Successors(struct.PyTreeNode):
     Besides, the region of a goal, or one that is practised, may always follow itself.
     """
 
-    greedy: Bool[Array, "R R"]
-    explore: Bool[Array, "R R"]
+    near: Near
+    """The regions of each row."""
+    greedy: Bool[Array, "R S"]
+    explore: Bool[Array, "R S"]
 
 
 class Roadmap(struct.PyTreeNode):
@@ -98,7 +100,7 @@ class Roadmap(struct.PyTreeNode):
 
     abstraction: Abstraction
     allowed: Successors
-    believed: Bool[Array, "R R"]
+    believed: Bool[Array, "R S"]
     """Pairs whose targets count as reachable as long as nobody has tried."""
     attraction: Float[Array, "R"] | None = None
     """Random targets are drawn in proportion to it; None: evenly."""
@@ -113,15 +115,17 @@ class Roadmap(struct.PyTreeNode):
         attraction: Float[Array, "R"] | None = None,
     ) -> Roadmap:
         """The roadmap of `graph`, under `commander.successors`."""
-        allowed = successors(section.successors, reaches=graph.reaches, misses=graph.misses, active=abstraction.active)
+        near, active = regions.near(abstraction, section.nearest), abstraction.active
+        allowed = successors(section.successors, near, reaches=graph.reaches, misses=graph.misses, active=active)
         believed = regions.adjacent(abstraction) & (graph.told >= 0)
         if section.successors != "all":
             believed = graph.reaches | (believed & ~graph.misses)
-        return cls(abstraction=abstraction, allowed=allowed, believed=believed, attraction=attraction)
+        return cls(abstraction=abstraction, allowed=allowed, believed=near.pairs(believed), attraction=attraction)
 
 
 def successors(
     mode: Literal["all", "any", "possible", "known"],
+    near: Near,
     *,
     reaches: Bool[Array, "R R"],
     misses: Bool[Array, "R R"],
@@ -133,16 +137,16 @@ def successors(
     those not shown unreachable (`possible`). A region may be its own target. With `known`, as published, both are made
     among others shown reachable, if there are any. With `all` nothing is left out.
     """
-    pairs = active[:, None] & active[None, :]
-    own = jnp.eye(active.shape[0], dtype=bool)
-    possible = pairs & (~misses | own)
+    pairs = active[:, None] & near.pairs(jnp.broadcast_to(active, misses.shape))
+    own = near.pairs(jnp.eye(active.shape[0], dtype=bool))
+    possible = pairs & (~near.pairs(misses) | own)
     if mode == "all":
-        return Successors(greedy=pairs, explore=pairs)
+        return Successors(near=near, greedy=pairs, explore=pairs)
     if mode != "known":
-        return Successors(greedy=pairs if mode == "any" else possible, explore=possible)
-    known = pairs & reaches & ~own
+        return Successors(near=near, greedy=pairs if mode == "any" else possible, explore=possible)
+    known = pairs & near.pairs(reaches) & ~own
     chosen = jnp.where(known.any(axis=1, keepdims=True), known, possible)
-    return Successors(greedy=chosen, explore=chosen)
+    return Successors(near=near, greedy=chosen, explore=chosen)
 
 
 def target_box(

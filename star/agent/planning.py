@@ -27,27 +27,28 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from star.abstraction import regions
-from star.abstraction.regions import Change
+from star.abstraction.regions import Change, Near
+from star.agent import values
 from star.agent.decisions import Decision, Finished, Roadmap, Successors
 from star.agent.sections import CommanderConfig
-from star.agent.values import CommanderState, Model, best
+from star.agent.values import CommanderState, Model
 
 _HUNCH = 0.1  # what belief is worth where nothing is to be tried
 _KEPT = 20.0  # decisions of a command that do not fade, since rare ones would be forgotten before they are enough
 
 
-def init(*, regions: int) -> Model:
+def init(*, regions: int, near: int) -> Model:
     """Nothing counted."""
-    cube = jnp.zeros((regions, regions, regions))
+    cube = jnp.zeros((regions, near, near))
     both = jnp.stack([cube, cube])
-    return Model(led=both, rewards=cube, visits=cube, lost=both[:, 0], reach=cube)
+    return Model(led=both, rewards=cube, visits=cube, lost=both[:, :, 0], reach=jnp.zeros((regions, regions, near)))
 
 
 def observe(
     section: CommanderConfig, state: CommanderState, roadmap: Roadmap, batch: Decision, *, margin: Array | float = 0.0
 ) -> CommanderState:
     """Count what the streams decided at one instant; teachers count like all others."""
-    return state.replace(model=_counted(_model(state), batch, cells=batch))
+    return state.replace(model=_counted(roadmap.allowed.near, _model(state), batch, cells=batch))
 
 
 def plan(
@@ -62,17 +63,17 @@ def plan(
 
 def _plan(
     section: CommanderConfig, roadmap: Roadmap, state: CommanderState
-) -> tuple[Float[Array, "R R R"], Float[Array, "R R R"]]:
+) -> tuple[Float[Array, "R R S"], Float[Array, "R R S"]]:
     """Q and `reach` by `section.sweeps` sweeps of value iteration on the model, from the values of last time.
 
     As long as nothing is known, region j is held reachable from i where `believed` [i, j], and who aims at a goal in
     his own region is taken to succeed (or, with rewards that are negative, to lose nothing anywhere).
     """
     model = _model(state)
-    chances, reward = _expectations(section, model, roadmap.believed, belief=1.0)
+    chances, reward = _expectations(section, model, roadmap, belief=1.0)
     pursued = jnp.broadcast_to(jnp.eye(state.chosen.shape[0])[..., None], reward.shape)
-    values, rewards = jnp.stack([state.q, model.reach]), jnp.stack([reward, pursued])
-    q, reach = _iterated(section, roadmap.allowed, values, rewards, chances, sweeps=section.sweeps)
+    tables, rewards = jnp.stack([state.q, model.reach]), jnp.stack([reward, pursued])
+    q, reach = _iterated(section, roadmap.allowed, tables, rewards, chances, sweeps=section.sweeps)
     return q, reach
 
 
@@ -85,7 +86,7 @@ def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *,
     """
     if section.reward != "success":
         return state
-    chances, reward = _expectations(section, _model(state), roadmap.believed, belief=_HUNCH)
+    chances, reward = _expectations(section, _model(state), roadmap, belief=_HUNCH)
     q = _iterated(section, roadmap.allowed, jnp.zeros_like(state.q)[None], reward[None], chances, sweeps=periods)[0]
     return state.replace(q=q)
 
@@ -125,8 +126,9 @@ def follow(
         goal_region=goal_region,
         target=jnp.where(decision.at_goal, goal_region, decision.target),
     )
-    model = recounted(section, earlier, decision, cells, change.origin, traffic)
-    return model.replace(reach=regions.inherit(_model(state).reach, change.origin))
+    then, now = (regions.near(table, section.nearest) for table in (change.before, change.after))
+    model = recounted(section, earlier, decision, cells, change.origin, traffic, then=then, now=now)
+    return model.replace(reach=values.inherited(_model(state).reach, change.origin, then=then, now=now))
 
 
 def recounted(
@@ -136,35 +138,44 @@ def recounted(
     cells: Decision,
     origin: Int[Array, "R"],
     traffic: Float[Array, "R R"],
+    *,
+    then: Near,
+    now: Near,
 ) -> Model:
-    """The `earlier` model and the decisions of `batch`, but for `reach`.
+    """The `earlier` model and the decisions of `batch`, but for `reach`. What is near was so `then` and is `now`.
 
     `cells` holds them with today's regions, but for the targets, which count as all their parts unless they were goals.
     """
-    counted = _counted(jax.tree.map(jnp.zeros_like, earlier), batch, cells=cells)
-    beside, own = _beside(origin), jnp.eye(len(origin), dtype=bool)
-    to_parts = lambda table: table.at[0].set(table[0][:, origin])  # noqa: E731
-    in_pursuit = lambda table: jnp.where(own, table, jnp.where(beside, 0.0, table[..., origin]))  # noqa: E731
+    counted = _counted(now, jax.tree.map(jnp.zeros_like, earlier), batch, cells=cells)
+    beside, own = _beside(now, origin), jnp.eye(now.region.shape[1], dtype=bool)
+    whole = jnp.take_along_axis(now.place, origin[now.region], axis=1)  # the place of what keeps the older index
+    of_whole = partial(regions.moved, places=whole)
+    to_parts = lambda table: table.at[0].set(of_whole(table[0], axis=1))  # noqa: E731
+    in_pursuit = lambda table: jnp.where(own, table, jnp.where(beside, 0.0, of_whole(table, axis=2)))  # noqa: E731
     new = counted.replace(
         led=to_parts(counted.led),
         lost=to_parts(counted.lost),
         rewards=in_pursuit(counted.rewards),
         visits=in_pursuit(counted.visits),
     )
-    old = _inherited(section, earlier, traffic, origin)
+    old = _inherited(section, earlier, traffic, origin, then=then, now=now)
     return jax.tree.map(jnp.add, old, new)
 
 
-def _counted(model: Model, batch: Decision, *, cells: Decision) -> Model:
-    """`model` with the decisions of `batch`, in the tables' cells that the regions of `cells` say."""
+def _counted(near: Near, model: Model, batch: Decision, *, cells: Decision) -> Model:
+    """`model` with the decisions of `batch`, in the tables' cells that the regions of `cells` say.
+
+    What led to a region that is not near has no cell and is not counted.
+    """
     direct = 1 - batch.aside
     # Practising agents aim at the centre of the goal's region, which tells nothing of aiming at the goal.
     beside = batch.practised * (batch.target == batch.goal_region)
     telling = jnp.maximum(batch.weight, batch.lost) * direct * (1 - beside)
-    command = (batch.at_goal.astype(jnp.int32), cells.region, cells.target)
-    pursuit = (cells.region, cells.goal_region, cells.target)
+    place = lambda region: near.place[cells.region, region]  # noqa: E731
+    command = (batch.at_goal.astype(jnp.int32), cells.region, place(cells.target))
+    pursuit = (cells.region, place(cells.goal_region), place(cells.target))
     return model.replace(
-        led=model.led.at[*command, cells.next_region].add(batch.weight * direct),
+        led=model.led.at[*command, place(cells.next_region)].add(batch.weight * direct),
         rewards=model.rewards.at[pursuit].add(telling * batch.reward),
         visits=model.visits.at[pursuit].add(telling),
         lost=model.lost.at[command].add(batch.lost * direct),
@@ -172,11 +183,15 @@ def _counted(model: Model, batch: Decision, *, cells: Decision) -> Model:
 
 
 def _expectations(
-    section: CommanderConfig, model: Model, believed: Bool[Array, "R R"], *, belief: float
-) -> tuple[Float[Array, "2 R R R"], Float[Array, "R R R"]]:
-    """P(i' | i, j) by aim, and r[i, g, j]: what was counted, and `belief` in what was not, else staying in place."""
-    identity = jnp.eye(believed.shape[0])
-    there, here = identity[None], identity[:, None]
+    section: CommanderConfig, model: Model, roadmap: Roadmap, *, belief: float
+) -> tuple[Float[Array, "2 R S S"], Float[Array, "R R S"]]:
+    """P(i' | i, j) by aim, and r[i, g, j]: what was counted, and `belief` in what was not, else staying in place.
+
+    Nothing is earned where the goal is not near.
+    """
+    near, believed = roadmap.allowed.near, roadmap.believed
+    own = jax.nn.one_hot(near.own, believed.shape[1])
+    there, here = jnp.eye(believed.shape[1])[None], own[:, None]
     expected = jnp.where(believed[..., None], belief * there + (1 - belief) * here, here)
     number = model.led.sum(axis=-1) + model.lost
     weight = _weight_of_belief(section, number)[..., None]
@@ -184,9 +199,10 @@ def _expectations(
     to_region = (model.led[0] + weight[0] * expected) / counted[0]
     to_goal = (model.led[1] + weight[1] * to_region) / counted[1]
     chances = jnp.stack([to_region, to_goal])
-    arrived = (section.reward == "success") * belief * identity[:, :, None] * identity[:, None]
+    arrived = (section.reward == "success") * belief * own[:, :, None] * own[:, None]
     weight = _weight_of_belief(section, model.visits)
-    return chances, (model.rewards + weight * arrived) / (model.visits + weight)
+    reward = (model.rewards + weight * arrived) / (model.visits + weight)
+    return chances, regions.moved(reward, near.place, axis=1)
 
 
 def _weight_of_belief(section: CommanderConfig, number: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -201,29 +217,35 @@ def _weight_of_belief(section: CommanderConfig, number: Float[Array, "*n"]) -> F
 def _iterated(
     section: CommanderConfig,
     allowed: Successors,
-    values: Float[Array, "V R R R"],
-    rewards: Float[Array, "V R R R"],
-    chances: Float[Array, "2 R R R"],
+    tables: Float[Array, "V R R S"],
+    rewards: Float[Array, "V R R S"],
+    chances: Float[Array, "2 R S S"],
     *,
     sweeps: int,
-) -> Float[Array, "V R R R"]:
-    """The tables `values` after sweeps of value iteration, each with its rewards; the first is that of goals."""
-    to_region, to_goal = chances
+) -> Float[Array, "V R R S"]:
+    """The `tables` of values after sweeps of value iteration, each with its rewards; the first is that of goals."""
+    (to_region, to_goal), near = chances, allowed.near.region
     product = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
-    own = jnp.eye(values.shape[1], dtype=bool)
+    at_goal = near[:, None] == jnp.arange(len(near))[None, :, None]
 
-    def sweep(values: Array, _: None) -> tuple[Array, None]:
-        future = jax.vmap(partial(best, allowed=allowed.greedy))(values)
-        later = product("ijn,vng->vigj", to_region, future)
-        at_goal = product("ign,ng->ig", to_goal, future[0])
-        later = later.at[0].set(jnp.where(own, at_goal[..., None], later[0]))
+    def sweep(tables: Array, _: None) -> tuple[Array, None]:
+        future = jax.vmap(partial(values.best, allowed=allowed))(tables)[:, near]
+        later = product("ijn,ving->vigj", to_region, future)
+        goals = product("ijn,inj->ij", to_goal, jnp.take_along_axis(future[0], near[:, None], axis=2))
+        later = later.at[0].set(jnp.where(at_goal, goals[:, None], later[0]))
         return rewards + section.discount * later, None
 
-    return jax.lax.scan(sweep, values, None, length=sweeps)[0]
+    return jax.lax.scan(sweep, tables, None, length=sweeps)[0]
 
 
 def _inherited(
-    section: CommanderConfig, earlier: Model, traffic: Float[Array, "R R"], origin: Int[Array, "R"]
+    section: CommanderConfig,
+    earlier: Model,
+    traffic: Float[Array, "R R"],
+    origin: Int[Array, "R"],
+    *,
+    then: Near,
+    now: Near,
 ) -> Model:
     """Counts of before the epoch in which regions were cut, by those of after it.
 
@@ -233,21 +255,23 @@ def _inherited(
     most, as is what aiming at the goal pays in its own part. What goals elsewhere paid is forgotten: nobody knows in
     which part they were, and one success in fifteen, believed of the wrong part, holds agents before a wall.
     """
-    inherit = partial(regions.inherit, origin=origin)
-    together = partial(regions.over_parts, origin=origin)
+    moved, together = partial(regions.moved, places=now.parts(then, origin)), partial(regions.over_parts, origin=origin)
     cut = together(jnp.ones(len(origin))) > 1
     share = jnp.where(cut[:, None] | cut, traffic / jnp.maximum(together(traffic), 1.0), 1.0)
     began = traffic.sum(axis=1)
     of_part = jnp.where(cut, began / jnp.maximum(together(began), 1.0), 1.0)
-    led = inherit(earlier.led, axes=(1, 2, 3)) * share[:, None]
-    lost = inherit(earlier.lost, axes=(1, 2)) * of_part[:, None]
-    elsewhere = (cut[:, None] | cut) & ~jnp.eye(len(origin), dtype=bool)
-    kept = jnp.where(elsewhere[..., None] | _beside(origin), 0.0, of_part[:, None, None])
-    rewards, visits = inherit(earlier.rewards) * kept, inherit(earlier.visits) * kept
+    led = moved(moved(earlier.led[:, origin], axis=2, rows=1), axis=3, rows=1) * now.pairs(share)[:, None]
+    lost = moved(earlier.lost[:, origin], axis=2, rows=1) * of_part[:, None]
+    either = now.pairs(cut[:, None] | cut)
+    elsewhere = either & (now.region != jnp.arange(len(origin))[:, None])
+    kept = jnp.where(elsewhere[..., None] | _beside(now, origin), 0.0, of_part[:, None, None])
+    rewards, visits = (
+        moved(moved(table[origin], axis=1), axis=2) * kept for table in (earlier.rewards, earlier.visits)
+    )
 
     doubt = lambda number: section.prior / jnp.maximum(number, section.prior)  # noqa: E731
     of_commands = jnp.where(cut[:, None], doubt(led.sum(axis=-1) + lost), 1.0)
-    of_pursuits = jnp.where((cut[:, None] | cut)[..., None], doubt(visits), 1.0)
+    of_pursuits = jnp.where(either[..., None], doubt(visits), 1.0)
     return earlier.replace(
         led=led * of_commands[..., None],
         lost=lost * of_commands,
@@ -256,9 +280,10 @@ def _inherited(
     )
 
 
-def _beside(origin: Int[Array, "R"]) -> Bool[Array, "R R"]:
-    """Mask of pairs of regions that are parts of one older region."""
-    return (origin[:, None] == origin) & ~jnp.eye(len(origin), dtype=bool)
+def _beside(near: Near, origin: Int[Array, "R"]) -> Bool[Array, "R S S"]:
+    """Mask of pairs, of those near a region, that are parts of one older region."""
+    of = origin[near.region]
+    return (of[:, :, None] == of[:, None]) & ~jnp.eye(of.shape[1], dtype=bool)
 
 
 def _model(state: CommanderState) -> Model:

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from star.abstraction.regions import Change
 from star.agent.decisions import Decision, Roadmap
@@ -23,7 +23,7 @@ from star.agent.sections import CommanderConfig
 from star.agent.values import CommanderState, td_error, towards_goals
 
 
-def init(*, regions: int) -> None:
+def init(*, regions: int, near: int) -> None:
     """It has no model."""
 
 
@@ -32,8 +32,12 @@ def observe(
 ) -> CommanderState:
     """A step on what the streams decided at one instant; what a teacher chose rises to `margin` above all else."""
     error = td_error(section, state, roadmap.allowed, batch)
-    state = _step(section, state, batch, error, weight=jnp.maximum(batch.weight, batch.lost) * towards_goals(batch))
-    return state if batch.shown is None else _follow_teacher(section, state, batch, batch.shown, margin)
+    cell = (batch.region, batch.goal_region, roadmap.allowed.near.place[batch.region, batch.target])
+    state = _step(section, state, cell, error, weight=jnp.maximum(batch.weight, batch.lost) * towards_goals(batch))
+    if batch.shown is None:
+        return state
+    lacking = _lacking(state.q[cell[:2]], cell[2], margin)
+    return _step(section, state, cell, lacking, weight=batch.weight * batch.shown)
 
 
 def plan(
@@ -56,30 +60,21 @@ def fade(section: CommanderConfig, state: CommanderState) -> None:
     """There is no model that could fade."""
 
 
-def _follow_teacher(
-    section: CommanderConfig,
-    state: CommanderState,
-    batch: Decision,
-    shown: Float[Array, "N"],
-    margin: Float[Array, ""] | float,
-) -> CommanderState:
-    """A step of the large-margin loss of DQfD on the decisions that were shown."""
-    row = state.q[batch.region, batch.goal_region]
-    chosen = jax.nn.one_hot(batch.target, row.shape[-1])
-    lacking = jnp.max(row + margin * (1 - chosen), axis=-1) - jnp.sum(row * chosen, axis=-1)
-    return _step(section, state, batch, lacking, weight=batch.weight * shown)
+def _lacking(row: Float[Array, "N S"], shown: Int[Array, "N"], margin: Array | float) -> Float[Array, "N"]:
+    """The large-margin loss of DQfD: how far the value of what was `shown` is from `margin` above the others'."""
+    chosen = jax.nn.one_hot(shown, row.shape[-1])
+    return jnp.max(row + margin * (1 - chosen), axis=-1) - jnp.sum(row * chosen, axis=-1)
 
 
 def _step(
     section: CommanderConfig,
     state: CommanderState,
-    batch: Decision,
+    cell: tuple[Int[Array, "N"], ...],
     error: Float[Array, "N"],
     *,
     weight: Float[Array, "N"],
 ) -> CommanderState:
     """Q after as many updates of each visited cell as its `weight` makes, all towards their mean `error`."""
-    cell = (batch.region, batch.goal_region, batch.target)
     visits = jnp.zeros_like(state.q).at[cell].add(weight)
     total = jnp.zeros_like(state.q).at[cell].add(weight * error)
     alpha = 1 - (1 - section.learning_rate) ** visits

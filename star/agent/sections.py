@@ -52,6 +52,9 @@ class CommanderConfig(Section):
         "Greedy targets are any, those not shown unreachable (possible), or those shown reachable (known); "
         "all ignores reachability in plans too.",
     )
+    nearest: Annotated[int, Field(ge=2)] | None = setting(
+        None, "Only so many of the nearest regions may follow one, so that large tables stay small; with null all may."
+    )
     reward: Literal["success", "mean", "max"] = setting(
         "success", "A decision earns the mean success of its k env steps, or the mean or maximum of the task's reward."
     )
@@ -77,6 +80,12 @@ class CommanderConfig(Section):
         unit="units of the state",
         gt=0,
     )
+
+    @model_validator(mode="after")
+    def _distances_pay_everywhere(self) -> Self:
+        if self.nearest is not None and self.learner == "model" and self.reward != "success":
+            raise ValueError(f"nearest: {self.nearest}, but reward {self.reward} pays far from the goal; allowed: null")
+        return self
 
 
 class AdjacencyConfig(Section):

@@ -7,29 +7,31 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from star.abstraction import regions
+from star.abstraction.regions import Near
 from star.agent.decisions import Decision, Successors
 from star.agent.sections import CommanderConfig
 
 
 class Model(struct.PyTreeNode):
-    """Fading counts of where commands led, and of the rewards on the way."""
+    """Fading counts of where commands led, and of the rewards on the way, by regions that are near each other."""
 
-    led: Float[Array, "2 R R R"]
+    led: Float[Array, "2 R S S"]
     """Decisions by aim (0: the target region, 1: the goal in it), region, target and next region."""
-    rewards: Float[Array, "R R R"]
+    rewards: Float[Array, "R S S"]
     """Sums of rewards by region, goal region and target, of those that ended an episode too."""
-    visits: Float[Array, "R R R"]
+    visits: Float[Array, "R S S"]
     """Decisions by region, goal region and target, with those that ended an episode."""
-    lost: Float[Array, "2 R R"]
+    lost: Float[Array, "2 R S"]
     """Decisions by aim, region and target during which the episode was terminated."""
-    reach: Float[Array, "R R R"]
+    reach: Float[Array, "R R S"]
     """Values like Q for those who practise: discounted chances of being in the pursued region."""
 
 
 class CommanderState(struct.PyTreeNode):
-    """Q over (region, goal region, target region), how often each target was chosen of late, and any `model`."""
+    """Q over (region, goal region, target near the region), how often each was a target of late, and any `model`."""
 
-    q: Float[Array, "R R R"]
+    q: Float[Array, "R R S"]
     chosen: Float[Array, "R"]
     model: Model | None = None
 
@@ -51,43 +53,52 @@ def choose(
     goal where they are not negative.
     """
     explore_key, random_key, tie_key = jax.random.split(key, 3)
+    near = allowed.near.region[region]
     reach = state.q if state.model is None else state.model.reach
     values = jnp.where((practised >= 0)[:, None], reach[region, practised], state.q[region, goal_region])
     pursued = jnp.where(practised >= 0, practised, goal_region)
-    best_values = jnp.where(targets(allowed.greedy, region, pursued), values, -jnp.inf)
+    best_values = jnp.where(targets(allowed.near, allowed.greedy, region, pursued), values, -jnp.inf)
     ties = best_values >= best_values.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best_values.shape), -1.0), axis=-1)
     luck = jax.random.gumbel(random_key, best_values.shape)
     if attraction is not None:
-        luck += jnp.log(jnp.maximum(attraction, 1e-6))
-    anything = jnp.where(targets(allowed.explore, region, pursued), luck, -jnp.inf)
+        luck += jnp.log(jnp.maximum(attraction, 1e-6))[near]
+    anything = jnp.where(targets(allowed.near, allowed.explore, region, pursued), luck, -jnp.inf)
     exploring = jax.random.uniform(explore_key, region.shape) < epsilon
-    return jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
+    place = jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
+    return jnp.take_along_axis(near, place[:, None], axis=1)[:, 0]
 
 
 def towards(
     state: CommanderState, allowed: Successors, goal_region: Int[Array, ""]
 ) -> tuple[Float[Array, "R"], Int[Array, "R"]]:
     """For g* in `goal_region`: the value of every region, and the target that is best there, the first of equals."""
-    possible = targets(allowed.greedy, jnp.arange(state.chosen.shape[0]), goal_region)
+    near, every = allowed.near, jnp.arange(state.chosen.shape[0])
+    possible = targets(near, allowed.greedy, every, goal_region)
     values = jnp.where(possible, state.q[:, goal_region], -jnp.inf)
-    return best(state.q, allowed.greedy)[:, goal_region], jnp.argmax(values, axis=-1)
+    return best(state.q, allowed)[:, goal_region], near.region[every, jnp.argmax(values, axis=-1)]
 
 
-def best(q: Float[Array, "R R R"], allowed: Bool[Array, "R R"]) -> Float[Array, "R R"]:
-    """Value of every region and goal region; 0 for regions that are not in use."""
-    own = jnp.arange(q.shape[0])
-    values = jnp.where(allowed[:, None], q, -jnp.inf).max(axis=-1)
-    values = values.at[own, own].max(q[own, own, own])
-    return jnp.where(allowed.any(axis=1)[:, None], values, 0.0)
+def best(q: Float[Array, "R R S"], allowed: Successors) -> Float[Array, "R R"]:
+    """Value of every region and goal region by greedy choices; 0 for regions that are not in use."""
+    own, greedy = jnp.arange(q.shape[0]), allowed.greedy
+    values = jnp.where(greedy[:, None], q, -jnp.inf).max(axis=-1)
+    values = values.at[own, own].max(q[own, own, allowed.near.own])
+    return jnp.where(greedy.any(axis=1)[:, None], values, 0.0)
+
+
+def inherited(q: Float[Array, "R R S"], origin: Int[Array, "R"], *, then: Near, now: Near) -> Float[Array, "R R S"]:
+    """The values of regions that were cut from `origin`, whose parts inherit them; near regions were others `then`."""
+    return regions.moved(regions.inherit(q, origin, axes=(0, 1)), now.parts(then, origin), axis=2)
 
 
 def td_error(
     section: CommanderConfig, state: CommanderState, allowed: Successors, batch: Decision
 ) -> Float[Array, "N"]:
     """R + gamma max Q' - Q, and R - Q where the task was terminated; time limits are not seen here."""
-    future = (1 - batch.lost) * best(state.q, allowed.greedy)[batch.next_region, batch.goal_region]
-    return batch.reward + section.discount * future - state.q[batch.region, batch.goal_region, batch.target]
+    future = (1 - batch.lost) * best(state.q, allowed)[batch.next_region, batch.goal_region]
+    cell = (batch.region, batch.goal_region, allowed.near.place[batch.region, batch.target])
+    return batch.reward + section.discount * future - state.q.at[cell].get(mode="fill", fill_value=0)
 
 
 def towards_goals(batch: Decision) -> Float[Array, "N"]:
@@ -95,7 +106,9 @@ def towards_goals(batch: Decision) -> Float[Array, "N"]:
     return (1 - batch.practised) * (1 - batch.aside)
 
 
-def targets(allowed: Bool[Array, "R R"], region: Int[Array, "n"], goal_region: Int[Array, "*n"]) -> Bool[Array, "n R"]:
-    """Mask of the regions that may follow each `region`, if the goal is in `goal_region`."""
-    home = jax.nn.one_hot(region, allowed.shape[0], dtype=bool)
+def targets(
+    near: Near, allowed: Bool[Array, "R S"], region: Int[Array, "n"], goal_region: Int[Array, "*n"]
+) -> Bool[Array, "n S"]:
+    """Mask of the regions near each `region` that may follow it, if the goal is in `goal_region`."""
+    home = near.region[region] == region[:, None]
     return allowed[region] | (home & (region == goal_region)[:, None])

@@ -10,7 +10,7 @@ import pytest
 
 from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
-from star.abstraction.regions import Change
+from star.abstraction.regions import Change, Near
 from star.agent import commander, goal_only, planning, values
 from star.agent.decisions import Decision, Finished, Roadmap, Successors, successors
 from star.agent.segments import Segment
@@ -21,10 +21,11 @@ from star.sgim.lessons import Marks
 from star.spec import Spec
 
 R, N = 5, 40
+ALL = Near.every(R)
 
 # Compiled once, not each time that a test calls them.
 counts = jax.jit(planning.observe)
-recounted = jax.jit(planning.recounted)
+recounted = jax.jit(partial(planning.recounted, then=ALL, now=ALL))
 plan, settle = jax.jit(commander.plan), jax.jit(planning.settle, static_argnames="periods")
 fade, follow = jax.jit(commander.fade), jax.jit(commander.follow)
 towards = jax.jit(values.towards)
@@ -49,7 +50,7 @@ def begun(chosen):
     return jax.device_get(commander.init(chosen, regions=R))
 
 
-EVERYTHING = Successors(np.ones((R, R), bool), np.ones((R, R), bool))
+EVERYTHING = Successors(ALL, np.ones((R, R), bool), np.ones((R, R), bool))
 
 
 def known(allowed, believed=None):
@@ -59,7 +60,7 @@ def known(allowed, believed=None):
 
 def counted(chosen, state, batch):
     """`state` with the decisions of `batch` in its model."""
-    return counts(chosen, state, None, batch)
+    return counts(chosen, state, known(EVERYTHING), batch)
 
 
 def settings(**values):
@@ -88,7 +89,7 @@ def random_state(seed):
     q = -rng.random((R, R, R)).astype(np.float32)
     allowed = rng.random((R, R)) < 0.6
     np.fill_diagonal(allowed, True)
-    return CommanderState(q=q, chosen=np.zeros(R, np.float32)), Successors(allowed, allowed)
+    return CommanderState(q=q, chosen=np.zeros(R, np.float32)), Successors(ALL, allowed, allowed)
 
 
 def slow_update(q, allowed, batch, *, alpha, discount):
@@ -390,14 +391,14 @@ def slow_successors(mode, reaches, misses, active):
 
 @pytest.mark.parametrize("mode", ["any", "possible", "known"])
 def test_successors_by_mode(mode):
-    got = follows(mode, reaches=REACHES, misses=MISSES, active=ACTIVE)
+    got = follows(mode, ALL, reaches=REACHES, misses=MISSES, active=ACTIVE)
     greedy, explore = slow_successors(mode, REACHES, MISSES, ACTIVE)
     np.testing.assert_array_equal(got.greedy, greedy)
     np.testing.assert_array_equal(got.explore, explore)
 
 
 def test_known_falls_back_to_what_is_possible_where_nothing_is_known():
-    got = jax.device_get(follows("known", reaches=REACHES, misses=MISSES, active=ACTIVE))
+    got = jax.device_get(follows("known", ALL, reaches=REACHES, misses=MISSES, active=ACTIVE))
     assert got.greedy[0].tolist() == [False, True, False, False, False]
     assert got.greedy[1].tolist() == [True, True, False, True, False]
     assert got.greedy[3].tolist() == [True, True, True, True, False]
@@ -406,7 +407,7 @@ def test_known_falls_back_to_what_is_possible_where_nothing_is_known():
 def test_a_goals_region_may_always_follow_itself():
     """Though others are known to be reachable from there, for choices and for what is to come."""
     onto = np.tile(np.arange(R) == 1, (R, 1))
-    allowed, q = Successors(greedy=onto, explore=onto), np.zeros((R, R, R), np.float32)
+    allowed, q = Successors(near=ALL, greedy=onto, explore=onto), np.zeros((R, R, R), np.float32)
     q[..., 0] = 1.0
     state = CommanderState(q=q, chosen=np.zeros(R, np.float32))
     for there, greedy, random in ((0, {0}, {0, 1}), (2, {1}, {1})):
@@ -422,7 +423,7 @@ def test_the_greedy_choice_is_the_best_allowed_target_and_ties_break_at_random()
     q, allowed = np.zeros((R, R, R), np.float32), np.tile(np.arange(R) != 2, (R, 1))
     q[0, 1] = [0.0, 3.0, 9.0, 3.0, 1.0]
     state = CommanderState(q=q, chosen=np.zeros(R, np.float32))
-    chosen, counts = np.unique(choose(state, Successors(allowed, allowed), 0, 1, epsilon=0.0), return_counts=True)
+    chosen, counts = np.unique(choose(state, Successors(ALL, allowed, allowed), 0, 1, epsilon=0.0), return_counts=True)
     assert chosen.tolist() == [1, 3]
     assert counts.min() > 0.3 * counts.sum()
 

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from star.abstraction.regions import Near
 from star.agent import values
 from star.agent.decisions import successors
 from star.agent.values import CommanderState
@@ -16,7 +17,7 @@ R, B = 6, 64
 
 def _choose(mode, q, reaches, misses, count, epsilon, key):
     active = jnp.arange(R) < count
-    allowed = successors(mode, reaches=reaches, misses=misses, active=active)
+    allowed = successors(mode, Near.every(R), reaches=reaches, misses=misses, active=active)
     where, goal = jax.random.randint(key, (2, B), 0, count)
     state = CommanderState(q=q, chosen=jnp.zeros(R))
     nobody = jnp.full(B, -1)

@@ -10,7 +10,7 @@ from scipy import stats
 
 from envs.common.errors import UserError
 from star.abstraction import regions
-from star.abstraction.regions import Change, Cut, Split
+from star.abstraction.regions import Change, Cut, Near, Split
 from star.agent import commander, levels, play, q_learning, tutor, values
 from star.agent.decisions import Decision, Roadmap, Scene, Successors
 from star.agent.segments import Segment
@@ -292,7 +292,7 @@ def test_edges_to_what_is_half_mastered_and_stands_still_are_the_most_urgent():
 def drawn(allowed, attraction, *, where, n=4000):
     """How often each of five regions is the random target of `n` who are `where` and have their goal there."""
     state = CommanderState(q=np.zeros((5, 5, 5), np.float32), chosen=np.zeros(5, np.float32))
-    both, here = Successors(allowed, allowed), np.full(n, where)
+    both, here = Successors(Near.every(5), allowed, allowed), np.full(n, where)
     attraction, key = np.float32(attraction), jax.random.key(0)
     found = choose(state, both, here, here, practised=np.full(n, -1), attraction=attraction, epsilon=1.0, key=key)
     return np.bincount(found, minlength=5)
@@ -315,7 +315,7 @@ def test_what_a_teacher_chose_rises_to_a_margin_above_the_rest():
     config = loading.parse({"commander": {"learner": "q", "learning_rate": 0.5, "reward": "mean"}}).commander
     q = put(np.zeros((3, 3, 3), np.float32), (0, 1), [0.0, 1.0, 0.4])
     state = CommanderState(q=q, chosen=np.zeros(3, np.float32))
-    allowed = Successors(np.ones((3, 3), bool), np.ones((3, 3), bool))
+    allowed = Successors(Near.every(3), np.ones((3, 3), bool), np.ones((3, 3), bool))
     one = lambda value: np.full(1, value, np.int32 if isinstance(value, int) else np.float32)  # noqa: E731
     decision = Decision(
         region=one(0),
