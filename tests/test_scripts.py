@@ -269,8 +269,11 @@ def test_a_row_is_measured_anew_as_its_json_says(tmp_path, monkeypatch):
     told = ["--seed", "0", "--seeds", "5", "--out", str(out), "--level", "0.9", "--episodes", "200", "--", *many]
     assert asked[0] == ["ant_fall", "gara", *told]
     assert asked[1][-2:] == ["--one-by-one", "--"] and asked[1][7] == str(out / "one_by_one")
+    script.main(["ant_fall/gara", "--runs", "elsewhere"])
+    assert asked[2] == [*asked[0][: -len(many) - 1], "--runs", "elsewhere", "--", *many]
     with pytest.raises(SystemExit, match=r"ant_fall/garra: results/ant_fall/garra.json is no row of results"):
-        script.main(["ant_fall/garra"])
+        script.main(["ant_fall/gara", "ant_fall/garra"])
+    assert len(asked) == 3  # nothing is measured before all rows are found
 
 
 TUNE = load("tune")

@@ -2,7 +2,7 @@
 
     python scripts/results/reproduce.py TASK [NAME ...] [--seed 0] [--seeds 5] [--level 0.9] [--one-by-one]
                                          [--out FOLDER] [-- SETTINGS]
-    python scripts/results/reproduce.py ROW [ROW ...]
+    python scripts/results/reproduce.py ROW [ROW ...] [--runs FOLDER] [--commit NAME]
 
 A ROW is a file of results/ without its ending, such as ant_fall/gara: it is measured anew as its JSON says, with the
 same settings and seeds.
@@ -31,10 +31,12 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import itertools
 import json
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -231,8 +233,8 @@ def _asked(curves: list[dict[str, Any]], name: str) -> dict[int, float]:
     return {step: float(np.mean(values)) for step, values in sorted(shares.items())}
 
 
-def again(row: str) -> list[str]:
-    """Arguments of this script that measure a row of results/ anew; SystemExit if there is no such row."""
+def again(row: str, options: Sequence[str] = ()) -> list[str]:
+    """Arguments of this script, with `options`, that measure a row of results/ anew; SystemExit if there is none."""
     path = ROOT / "results" / f"{row}.json"
     try:
         report = json.loads(path.read_text(encoding="utf-8"))
@@ -244,7 +246,7 @@ def again(row: str) -> list[str]:
     alone = ["--one-by-one"] * all(len(run["seeds"]) == 1 for run in runs)
     level = ["--level", str(report.get("level", LEVEL)), "--episodes", str(report["seeds"][0]["episodes"])]
     which = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), "--out", str(path.parent)]
-    return [report["task"], report["name"], *which, *level, *alone, "--", *settings]
+    return [report["task"], report["name"], *which, *level, *alone, *options, "--", *settings]
 
 
 def _told_by_us(words: list[str], place: int) -> bool:
@@ -257,8 +259,9 @@ def main(arguments: list[str] | None = None) -> None:
     """Measure agents of one task, or rows anew."""
     given = sys.argv[1:] if arguments is None else arguments
     if given and "/" in given[0]:
-        for row in given:
-            fill(again(row))
+        rows = list(itertools.takewhile(lambda word: not word.startswith("-"), given))
+        for asked in [again(row, given[len(rows) :]) for row in rows]:
+            fill(asked)
     else:
         fill(given)
 
