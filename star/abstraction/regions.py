@@ -141,7 +141,7 @@ class Near(struct.PyTreeNode):
         return jnp.diagonal(self.place)
 
     def pairs(self, table: Shaped[Array, "R R"]) -> Shaped[Array, "R S"]:
-        """What a table of all pairs says of those that are near."""
+        """The entries of a table of all pairs for those that are near."""
         return jnp.take_along_axis(table, self.region, axis=1)
 
     def parts(self, earlier: Near, origin: Int[Array, "R"]) -> Int[Array, "R S"]:

@@ -142,7 +142,7 @@ def recounted(
     then: Near,
     now: Near,
 ) -> Model:
-    """The `earlier` model and the decisions of `batch`, but for `reach`. What is near was so `then` and is `now`.
+    """The `earlier` model and the decisions of `batch`, but for `reach`. Regions were near `then` and are `now`.
 
     `cells` holds them with today's regions, but for the targets, which count as all their parts unless they were goals.
     """

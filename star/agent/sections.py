@@ -53,7 +53,9 @@ class CommanderConfig(Section):
         "all ignores reachability in plans too.",
     )
     nearest: Annotated[int, Field(ge=2)] | None = setting(
-        None, "Only so many of the nearest regions may follow one, so that large tables stay small; with null all may."
+        None,
+        "Only so many of the nearest regions may follow one, so large tables stay small; with null all may.",
+        unit="regions",
     )
     reward: Literal["success", "mean", "max"] = setting(
         "success", "A decision earns the mean success of its k env steps, or the mean or maximum of the task's reward."
