@@ -3,14 +3,16 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from envs.common.errors import UserError
 from star.abstraction import regions
-from star.abstraction.regions import Near
+from star.abstraction.forward_model import Outcome
+from star.abstraction.regions import Change, Near
 from star.agent import commander, planning, q_learning, values
-from star.agent.decisions import Decision, Roadmap, Successors
+from star.agent.decisions import Decision, Finished, Roadmap, Successors
 from star.agent.values import CommanderState, Model
 from star.config import loading
 
@@ -195,3 +197,36 @@ def test_distances_pay_far_from_the_goal_so_they_need_all_targets():
         settings(nearest=4, reward="mean")
     with pytest.raises(UserError, match=r"commander\.nearest: 1 is not allowed"):
         settings(nearest=1)
+
+
+def test_the_commander_follows_cuts_by_what_was_near_before_and_is_after_them():
+    before = regions.create(((0.0, 0.0), (6.0, 2.0)), ((1.0, 2.0, 3.0, 4.0), ()), max_regions=R)
+    after, splits = before, []
+    for region, place in ((1, 1.5), (4, 5.0)):
+        one = regions.Cut(jnp.int32(region), jnp.int32(0), jnp.float32(place))
+        child = after.count
+        after, done = regions.split(after, one, min_width=0.1)
+        splits.append(regions.Split(done=done, cut=one, child=child))
+    change = Change.of(before, after, jax.tree.map(lambda *x: jnp.stack(x), *splits))
+    then, now = (jax.device_get(regions.near(table, S)) for table in (before, after))
+    assert (then.region != now.region).any()
+    rng = np.random.default_rng(0)
+    centre = (np.asarray(after.lower) + np.asarray(after.upper)) / 2
+    cells = decisions(rng, now)
+    finished = Finished(
+        cells.replace(goal=centre[cells.goal_region].astype(np.float32)),
+        Outcome(*(centre[cells.region].astype(np.float32),) * 3, centre[cells.next_region], cells.weight),
+    )
+    q = rng.random((R, R, S)).astype(np.float32)
+    states = []
+    for section, table in ((settings(nearest=S), q), (settings(), spread(q, then, axes=(2,), rows=0))):
+        state = commander.init(section, regions=R)
+        state = state.replace(q=jnp.asarray(table), model=state.model.replace(reach=jnp.asarray(table)))
+        traffic = np.zeros((R, R), np.float32)
+        states.append(jax.jit(commander.follow)(section, state, change, state, finished, traffic))
+    found, expected = states
+    assert np.asarray(found.model.led).any()
+    for name, where in CELLS.items():
+        table = gathered(np.asarray(getattr(expected.model, name)), now, **where)
+        np.testing.assert_allclose(getattr(found.model, name), table, rtol=1e-5, err_msg=name)
+    np.testing.assert_array_equal(found.q, gathered(np.asarray(expected.q), now, axes=(2,), rows=0))
