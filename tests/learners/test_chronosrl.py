@@ -195,7 +195,7 @@ def test_the_critics_losses_are_those_of_the_equations():
 
 def test_it_learns_to_go_to_goals_that_no_reward_tells_of():
     chosen = settings(**SIZES, discount=0.95, goal_discount=0.8, learning_rate=1e-2)
-    assert (np.median(places.cosines(chronosrl, chosen, rollouts=4), axis=0) > 0.9).all()
+    assert (np.median(places.cosines(chronosrl.LEARNER, chosen, rollouts=4), axis=0) > 0.9).all()
 
 
 def random(example):

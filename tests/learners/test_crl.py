@@ -112,7 +112,7 @@ def test_it_learns_to_go_to_goals_that_no_reward_tells_of():
     chosen = settings(
         hidden=[32], batch_size=64, buffer_size=1536, updates_per_rollout=30, learning_rate=5e-3, discount=0.8
     )
-    assert np.median(places.cosines(crl, chosen, rollouts=5)) > 0.9
+    assert np.median(places.cosines(crl.LEARNER, chosen, rollouts=5)) > 0.9
 
 
 @pytest.mark.parametrize(
