@@ -111,9 +111,10 @@ def commands(plan: Plan, region: int, goal_region: int, number: int) -> list[str
     worth = np.where(possible, plan.q[region, goal_region], -np.inf)
     lines = []
     for place in np.argsort(-worth)[: min(number, plan.count)]:
-        line = f"  {near[place]} {plan.box(near[place])}: value {worth[place]:.3f}"
+        target = near[place]
+        line = f"  {target} {plan.box(target)}: value {worth[place]:.3f}"
         if plan.led is not None:
-            led = plan.led[int(near[place] == goal_region), region, place]
+            led = plan.led[int(target == goal_region), region, place]
             ends = [
                 f"{near[j]}: {led[j]:.1f}, {plan.values[near[j], goal_region]:.3f}"
                 for j in np.argsort(-led)[:LED]

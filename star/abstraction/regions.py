@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -140,13 +141,32 @@ class Near(struct.PyTreeNode):
         """The place of each region in its own list."""
         return jnp.diagonal(self.place)
 
+    @property
+    def home(self) -> Bool[Array, "R S"]:
+        """Mask of the own place."""
+        return self.region == jnp.arange(len(self.region))[:, None]
+
     def pairs(self, table: Shaped[Array, "R R"]) -> Shaped[Array, "R S"]:
         """The entries of a table of all pairs for those that are near."""
         return jnp.take_along_axis(table, self.region, axis=1)
 
-    def parts(self, earlier: Near, origin: Int[Array, "R"]) -> Int[Array, "R S"]:
-        """For each place of a table of today, that of what was cut (`origin`) in the `earlier` table."""
-        return earlier.place[origin[:, None], origin[self.region]]
+
+class Places(NamedTuple):
+    """The places of tables before and after cuts: regions were near `then` and are `now`, each a part of `origin`."""
+
+    origin: Int[Array, "R"]
+    then: Near
+    now: Near
+
+    @classmethod
+    def of(cls, change: Change, number: int | None) -> Places:
+        """Those of a change of the regions, of which so many are near (None: all)."""
+        return cls(change.origin, near(change.before, number), near(change.after, number))
+
+    @property
+    def parts(self) -> Int[Array, "R S"]:
+        """For each place of today, the earlier one of what was cut; S where that was not near."""
+        return self.then.place[self.origin[:, None], self.origin[self.now.region]]
 
 
 def near(abstraction: Abstraction, number: int | None) -> Near:
@@ -158,13 +178,10 @@ def near(abstraction: Abstraction, number: int | None) -> Near:
     lower, upper = abstraction.lower / size, abstraction.upper / size
     gap = jnp.maximum(lower[:, None] - upper, lower - upper[:, None])
     between = (lower[:, None] + upper[:, None] - lower - upper) / 2
-    away = _length(jnp.maximum(gap, 0.0)) + _CENTRES * _length(between)
+    length = partial(jnp.linalg.norm, axis=-1)
+    away = length(jnp.maximum(gap, 0.0)) + _CENTRES * length(between)
     away = jnp.where(jnp.eye(capacity, dtype=bool), -1.0, jnp.where(abstraction.active, away, jnp.inf))
     return Near.of(jnp.sort(jax.lax.top_k(-away, number)[1], axis=1))
-
-
-def _length(vector: Float[Array, "*n d"]) -> Float[Array, "*n"]:
-    return jnp.sqrt(jnp.square(vector).sum(axis=-1))
 
 
 def create(space: tuple[ArrayLike, ArrayLike], cuts: Sequence[Sequence[float]], *, max_regions: int) -> Abstraction:

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float
 from envs.common.batching import where
 from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
-from star.abstraction.regions import Box, Change
+from star.abstraction.regions import Box, Change, Places
 from star.agent import planning, q_learning, values
 from star.agent.decisions import ANY, Decision, Finished, Memory, Roadmap, Scene, target_box
 from star.agent.sections import CommanderConfig
@@ -231,11 +231,10 @@ def follow(
 
     Parts inherit the values of the whole. `traffic` says how many remembered periods led from each region into each.
     """
-    origin = change.origin
+    origin, places = change.origin, Places.of(change, section.nearest)
     parts = regions.over_parts(jnp.ones(len(origin)), origin)
-    model = _rule(section).follow(section, state, change, known.model, finished, traffic)
-    then, now = (regions.near(table, section.nearest) for table in (change.before, change.after))
-    q = values.inherited(state.q, origin, then=then, now=now)
+    model = _rule(section).follow(section, state, change, places, known.model, finished, traffic)
+    q = values.inherited(state.q, places)
     return state.replace(q=q, chosen=state.chosen[origin] / parts, model=model)
 
 

@@ -137,14 +137,13 @@ def successors(
     those not shown unreachable (`possible`). A region may be its own target. With `known`, as published, both are made
     among others shown reachable, if there are any. With `all` nothing is left out.
     """
-    pairs = active[:, None] & near.pairs(jnp.broadcast_to(active, misses.shape))
-    own = near.pairs(jnp.eye(active.shape[0], dtype=bool))
-    possible = pairs & (~near.pairs(misses) | own)
+    pairs = active[:, None] & active[near.region]
+    possible = pairs & (~near.pairs(misses) | near.home)
     if mode == "all":
         return Successors(near=near, greedy=pairs, explore=pairs)
     if mode != "known":
         return Successors(near=near, greedy=pairs if mode == "any" else possible, explore=possible)
-    known = pairs & near.pairs(reaches) & ~own
+    known = pairs & near.pairs(reaches) & ~near.home
     chosen = jnp.where(known.any(axis=1, keepdims=True), known, possible)
     return Successors(near=near, greedy=chosen, explore=chosen)
 

@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from star.abstraction import regions
-from star.abstraction.regions import Change, Near
+from star.abstraction.regions import Change, Near, Places
 from star.agent import values
 from star.agent.decisions import Decision, Finished, Roadmap, Successors
 from star.agent.sections import CommanderConfig
@@ -108,6 +108,7 @@ def follow(
     section: CommanderConfig,
     state: CommanderState,
     change: Change,
+    places: Places,
     earlier: Model,
     finished: Finished,
     traffic: Float[Array, "R R"],
@@ -126,9 +127,8 @@ def follow(
         goal_region=goal_region,
         target=jnp.where(decision.at_goal, goal_region, decision.target),
     )
-    then, now = (regions.near(table, section.nearest) for table in (change.before, change.after))
-    model = recounted(section, earlier, decision, cells, change.origin, traffic, then=then, now=now)
-    return model.replace(reach=values.inherited(_model(state).reach, change.origin, then=then, now=now))
+    model = recounted(section, earlier, decision, cells, places, traffic)
+    return model.replace(reach=values.inherited(_model(state).reach, places))
 
 
 def recounted(
@@ -136,16 +136,14 @@ def recounted(
     earlier: Model,
     batch: Decision,
     cells: Decision,
-    origin: Int[Array, "R"],
+    places: Places,
     traffic: Float[Array, "R R"],
-    *,
-    then: Near,
-    now: Near,
 ) -> Model:
-    """The `earlier` model and the decisions of `batch`, but for `reach`. Regions were near `then` and are `now`.
+    """The `earlier` model and the decisions of `batch`, but for `reach`.
 
     `cells` holds them with today's regions, but for the targets, which count as all their parts unless they were goals.
     """
+    origin, now = places.origin, places.now
     counted = _counted(now, jax.tree.map(jnp.zeros_like, earlier), batch, cells=cells)
     beside, own = _beside(now, origin), jnp.eye(now.region.shape[1], dtype=bool)
     whole = jnp.take_along_axis(now.place, origin[now.region], axis=1)  # the place of what keeps the older index
@@ -158,7 +156,7 @@ def recounted(
         rewards=in_pursuit(counted.rewards),
         visits=in_pursuit(counted.visits),
     )
-    old = _inherited(section, earlier, traffic, origin, then=then, now=now)
+    old = _inherited(section, earlier, traffic, places)
     return jax.tree.map(jnp.add, old, new)
 
 
@@ -190,7 +188,7 @@ def _expectations(
     Nothing is earned where the goal is not near.
     """
     near, believed = roadmap.allowed.near, roadmap.believed
-    own = jax.nn.one_hot(near.own, believed.shape[1])
+    own = near.home.astype(model.led.dtype)
     there, here = jnp.eye(believed.shape[1])[None], own[:, None]
     expected = jnp.where(believed[..., None], belief * there + (1 - belief) * here, here)
     number = model.led.sum(axis=-1) + model.lost
@@ -238,15 +236,7 @@ def _iterated(
     return jax.lax.scan(sweep, tables, None, length=sweeps)[0]
 
 
-def _inherited(
-    section: CommanderConfig,
-    earlier: Model,
-    traffic: Float[Array, "R R"],
-    origin: Int[Array, "R"],
-    *,
-    then: Near,
-    now: Near,
-) -> Model:
+def _inherited(section: CommanderConfig, earlier: Model, traffic: Float[Array, "R R"], places: Places) -> Model:
     """Counts of before the epoch in which regions were cut, by those of after it.
 
     Nobody knows any more which command led from where to where within the regions of then. But how many periods led
@@ -255,7 +245,8 @@ def _inherited(
     most, as is what aiming at the goal pays in its own part. What goals elsewhere paid is forgotten: nobody knows in
     which part they were, and one success in fifteen, believed of the wrong part, holds agents before a wall.
     """
-    moved, together = partial(regions.moved, places=now.parts(then, origin)), partial(regions.over_parts, origin=origin)
+    origin, now = places.origin, places.now
+    moved, together = partial(regions.moved, places=places.parts), partial(regions.over_parts, origin=origin)
     cut = together(jnp.ones(len(origin))) > 1
     share = jnp.where(cut[:, None] | cut, traffic / jnp.maximum(together(traffic), 1.0), 1.0)
     began = traffic.sum(axis=1)
@@ -263,7 +254,7 @@ def _inherited(
     led = moved(moved(earlier.led[:, origin], axis=2, rows=1), axis=3, rows=1) * now.pairs(share)[:, None]
     lost = moved(earlier.lost[:, origin], axis=2, rows=1) * of_part[:, None]
     either = now.pairs(cut[:, None] | cut)
-    elsewhere = either & (now.region != jnp.arange(len(origin))[:, None])
+    elsewhere = either & ~now.home
     kept = jnp.where(elsewhere[..., None] | _beside(now, origin), 0.0, of_part[:, None, None])
     rewards, visits = (
         moved(moved(table[origin], axis=1), axis=2) * kept for table in (earlier.rewards, earlier.visits)

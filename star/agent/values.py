@@ -8,7 +8,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from star.abstraction import regions
-from star.abstraction.regions import Near
+from star.abstraction.regions import Near, Places
 from star.agent.decisions import Decision, Successors
 from star.agent.sections import CommanderConfig
 
@@ -87,9 +87,9 @@ def best(q: Float[Array, "R R S"], allowed: Successors) -> Float[Array, "R R"]:
     return jnp.where(greedy.any(axis=1)[:, None], values, 0.0)
 
 
-def inherited(q: Float[Array, "R R S"], origin: Int[Array, "R"], *, then: Near, now: Near) -> Float[Array, "R R S"]:
-    """The values of regions that were cut from `origin`, whose parts inherit them; near regions were others `then`."""
-    return regions.moved(regions.inherit(q, origin, axes=(0, 1)), now.parts(then, origin), axis=2)
+def inherited(q: Float[Array, "R R S"], places: Places) -> Float[Array, "R R S"]:
+    """The values of regions that were cut: their parts inherit them."""
+    return regions.moved(regions.inherit(q, places.origin, axes=(0, 1)), places.parts, axis=2)
 
 
 def td_error(
@@ -110,5 +110,4 @@ def targets(
     near: Near, allowed: Bool[Array, "R S"], region: Int[Array, "n"], goal_region: Int[Array, "*n"]
 ) -> Bool[Array, "n S"]:
     """Mask of the regions near each `region` that may follow it, if the goal is in `goal_region`."""
-    home = near.region[region] == region[:, None]
-    return allowed[region] | (home & (region == goal_region)[:, None])
+    return allowed[region] | (near.home[region] & (region == goal_region)[:, None])

@@ -10,7 +10,7 @@ import pytest
 
 from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
-from star.abstraction.regions import Change, Near
+from star.abstraction.regions import Change, Near, Places
 from star.agent import commander, goal_only, planning, values
 from star.agent.decisions import Decision, Finished, Roadmap, Successors, successors
 from star.agent.segments import Segment
@@ -25,7 +25,11 @@ ALL = Near.every(R)
 
 # Compiled once, not each time that a test calls them.
 counts = jax.jit(planning.observe)
-recounted = jax.jit(partial(planning.recounted, then=ALL, now=ALL))
+recounted = jax.jit(
+    lambda section, earlier, batch, cells, origin, traffic: planning.recounted(
+        section, earlier, batch, cells, Places(origin, ALL, ALL), traffic
+    )
+)
 plan, settle = jax.jit(commander.plan), jax.jit(planning.settle, static_argnames="periods")
 fade, follow = jax.jit(commander.fade), jax.jit(commander.follow)
 towards = jax.jit(values.towards)

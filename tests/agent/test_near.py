@@ -10,7 +10,7 @@ import pytest
 from envs.common.errors import UserError
 from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
-from star.abstraction.regions import Change, Near
+from star.abstraction.regions import Change, Near, Places
 from star.agent import commander, planning, q_learning, values
 from star.agent.decisions import Decision, Finished, Roadmap, Successors
 from star.agent.values import CommanderState, Model
@@ -129,15 +129,15 @@ def test_after_cuts_tables_say_the_same_of_what_was_near_and_is(seed):
     earlier = Model(**{name: 3 * rng.random(size, np.float32) for name, size in sizes.items()})
     wide = Model(**{name: spread(getattr(earlier, name), then, **where) for name, where in CELLS.items()})
     cells, traffic = decisions(rng, now), rng.integers(0, 3, (R, R)).astype(np.float32)
-    everything = Near.every(R)
+    places, every = Places(origin, then, now), Places(origin, Near.every(R), Near.every(R))
     sure = settings(nearest=S, prior=1e6), settings(prior=1e6)  # else more is forgotten of what led far
-    found = recounted(sure[0], earlier, cells, cells, origin, traffic, then=then, now=now)
-    expected = recounted(sure[1], wide, cells, cells, origin, traffic, then=everything, now=everything)
+    found = recounted(sure[0], earlier, cells, cells, places, traffic)
+    expected = recounted(sure[1], wide, cells, cells, every, traffic)
     for name in ("led", "lost", "rewards", "visits"):
         table = gathered(np.asarray(getattr(expected, name)), now, **CELLS[name])
         np.testing.assert_allclose(getattr(found, name), table, rtol=1e-5, atol=1e-6, err_msg=name)
-    inherited = values.inherited(earlier.reach, origin, then=then, now=now)
-    table = values.inherited(wide.reach, origin, then=everything, now=everything)
+    inherited = values.inherited(earlier.reach, places)
+    table = values.inherited(wide.reach, every)
     np.testing.assert_array_equal(inherited, gathered(np.asarray(table), now, axes=(2,), rows=0))
 
 
