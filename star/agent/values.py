@@ -97,8 +97,13 @@ def td_error(
 ) -> Float[Array, "N"]:
     """R + gamma max Q' - Q, and R - Q where the task was terminated; time limits are not seen here."""
     future = (1 - batch.lost) * best(state.q, allowed)[batch.next_region, batch.goal_region]
-    cell = (batch.region, batch.goal_region, allowed.near.place[batch.region, batch.target])
+    cell = entries(allowed.near, batch)
     return batch.reward + section.discount * future - state.q.at[cell].get(mode="fill", fill_value=0)
+
+
+def entries(near: Near, batch: Decision) -> tuple[Int[Array, "N"], Int[Array, "N"], Int[Array, "N"]]:
+    """Indices into Q of what was decided; the last is beyond its axis where the target is not near."""
+    return batch.region, batch.goal_region, near.place[batch.region, batch.target]
 
 
 def towards_goals(batch: Decision) -> Float[Array, "N"]:
