@@ -1,4 +1,5 @@
 import argparse
+import ast
 import collections
 import dataclasses
 import itertools
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +37,20 @@ from star.training import program as programs
 from star.training.checkpoint import Checkpoints, Damaged
 from star.training.journal import JsonLines
 from tests.scripts import load
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+FILES = sorted(path.relative_to(SCRIPTS).with_suffix("").as_posix() for path in SCRIPTS.rglob("*.py"))
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_script_takes_from_modules_only_what_they_have(name):
+    script = load(name)
+    modules = {alias: value for alias, value in vars(script).items() if isinstance(value, ModuleType)}
+    found = [node for node in ast.walk(ast.parse(Path(script.__file__).read_text())) if isinstance(node, ast.Attribute)]
+    used = [
+        (node.value.id, node.attr) for node in found if isinstance(node.value, ast.Name) and node.value.id in modules
+    ]
+    assert [f"{module}.{attr}" for module, attr in used if not hasattr(modules[module], attr)] == []
 
 
 def test_the_periods_of_an_agent_are_told_with_the_regions_that_hold_its_places(run, capsys):

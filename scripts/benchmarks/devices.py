@@ -29,8 +29,9 @@ from typing import Any
 import jax
 
 from envs.vector import VectorEnv
-from star import cli, devices
+from star import devices
 from star.agent import environment
+from star.cli.words import split_settings
 from star.config.loading import load
 from star.training import program as programs
 from star.training.profiling import timed
@@ -46,7 +47,7 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=3)
     parser.add_argument("--per-device-envs", type=int, default=4096)
     parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)  # a process that measures writes its row there
-    words, settings = cli.split_settings(sys.argv[1:])
+    words, settings = split_settings(sys.argv[1:])
     options = parser.parse_args(words)
     if options.out is not None:
         row = measure(options.config, options.devices[0], options.epochs, options.per_device_envs, settings)

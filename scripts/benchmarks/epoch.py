@@ -21,10 +21,10 @@ import jax
 import jax.numpy as jnp
 
 import envs
-from star import cli
 from star.abstraction import forward_model as models
 from star.abstraction import refinement
 from star.agent.state import TrainState
+from star.cli.words import split_settings
 from star.config.loading import load
 from star.training import program as programs
 
@@ -33,7 +33,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("config", type=Path)
     parser.add_argument("--epochs", type=int, default=3)
-    words, settings = cli.split_settings(sys.argv[1:])
+    words, settings = split_settings(sys.argv[1:])
     options = parser.parse_args(words)
     print(json.dumps(benchmark(options.config, options.epochs, settings)))
 

@@ -27,7 +27,7 @@ import jax
 import numpy as np
 import optuna
 
-from star import cli
+from star.cli.words import split_settings
 from star.sweeps.plan import Plan, plan
 from star.training.side_by_side import SideBySide
 
@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path)
     parser.add_argument("--alone", type=int, default=4, help="trials that are run one after another")
-    words, settings = cli.split_settings(sys.argv[1:])
+    words, settings = split_settings(sys.argv[1:])
     options = parser.parse_args(words)
     print(json.dumps(benchmark(options.file, options.alone, settings), indent=2))
 

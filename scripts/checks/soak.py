@@ -34,7 +34,7 @@ from typing import Any
 
 import jax
 
-from star import cli
+from star.cli.words import split_settings
 from star.config.loading import load
 from star.training import provenance, trainer
 from star.training.checkpoint import Checkpoints
@@ -299,7 +299,7 @@ def growth(samples: Sequence[Mapping[str, float]], *, settle_s: float) -> dict[s
 
 
 def main() -> None:
-    words, settings = cli.split_settings(sys.argv[1:])
+    words, settings = split_settings(sys.argv[1:])
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     one = commands.add_parser("kills")
