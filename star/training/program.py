@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -35,9 +37,12 @@ class Functions:
     States and keys have a leading axis. The floats of the hyperparameters are scalars or have that axis too.
     """
 
-    init: Callable[[Any, jax.Array], Any]
-    epoch: Callable[[Any, Any, Any], tuple[Any, dict[str, jax.Array]]]
-    evaluate: Callable[[Any, Any, jax.Array], Any]
+    init: jax.stages.Wrapped
+    """(hyper, keys) -> states."""
+    epoch: jax.stages.Wrapped
+    """(hyper, data, states) -> (states, metrics); the states given are used up."""
+    evaluate: jax.stages.Wrapped
+    """(hyper, states, keys) -> what `Experiment.rows` takes."""
 
 
 @dataclass(frozen=True)
@@ -71,17 +76,26 @@ class Program:
         return self.functions.evaluate(self.hyper, state, keys)
 
     @contextmanager
-    def preparing(self) -> Iterator[None]:
-        """The evaluation compiles in a thread, and Matplotlib is imported there, while the body goes on.
+    def compiling(self) -> Iterator[Callable[[], object]]:
+        """All that a run needs compiles in threads while the body goes on, and Matplotlib is imported there.
 
-        Errors of either are left to its first use.
+        A call of what is yielded waits until an epoch can run. Errors of each part are left to its first use.
         """
-        evaluate = self.functions.evaluate
-        with ThreadPoolExecutor(max_workers=1) as pool:
-            if isinstance(evaluate, jax.stages.Wrapped):
-                pool.submit(lambda: evaluate.lower(self.hyper, self.example(), self.evaluation_keys(0)).compile())
-            pool.submit(import_module, "matplotlib.figure")
-            yield
+        pool, parts = ThreadPoolExecutor(), []
+        if jax.process_count() == 1:  # several would have to compile in one order
+            parts = [pool.submit(self._compile, pool), pool.submit(self.experiment.warm_up)]
+        try:
+            yield lambda: wait(parts)
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    def _compile(self, pool: ThreadPoolExecutor) -> None:
+        """Compile an epoch, and in other threads what is needed after it."""
+        epoch, evaluate = self.functions.epoch, self.functions.evaluate
+        traced = epoch.lower(self.hyper, self.data(), self.example())  # first of all: Python traces one at a time
+        pool.submit(lambda: evaluate.lower(self.hyper, self.example(), self.evaluation_keys(0)).compile())
+        pool.submit(import_module, "matplotlib.figure")
+        traced.compile()
 
     def rows(self, evaluated: Any) -> list[dict[str, Any]]:
         """The evaluation of each seed, as plain numbers with the keys of rows of metrics."""
@@ -156,6 +170,14 @@ def select_device(device: str) -> None:
             f"trainer.device: 'gpu' is not available, JAX sees only {jax.default_backend()}; "
             f"on a machine with an NVIDIA GPU {extras.install('cuda', 'warp')}, or use auto or cpu"
         )
+    _keep_compiled()
+
+
+def _keep_compiled() -> None:
+    """On GPUs keep compiled programs in the user's cache, for later runs, unless JAX is told where to, or not to."""
+    if jax.default_backend() == "gpu" and jax.config.values["jax_compilation_cache_dir"] is None:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(home / "star" / "jax"))
 
 
 def structure(config: RunConfig) -> str:

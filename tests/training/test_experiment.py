@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -21,7 +22,9 @@ from star.config.kinds import Measure
 from star.config.loading import parse
 from star.sweeps import work as working
 from star.training.checkpoint import Checkpoints
+from star.training.experiment import Experiment
 from star.training.journal import JsonLines
+from star.training.program import Program, select_device
 from tests.small import arrays
 
 PAGE = Path(__file__).parents[2] / "docs" / "experiments.md"
@@ -94,6 +97,35 @@ def test_the_evaluation_compiles_once_in_a_thread_beside_the_first_epoch(here, c
         jax.config.update("jax_log_compiles", False)
     threads = [one.threadName for one in caplog.records if one.getMessage().startswith("Compiling jit(evaluate)")]
     assert len(threads) == 1 and threads[0].startswith("ThreadPool")
+
+
+def test_an_epoch_waits_for_what_warms_up_beside_it_and_minds_no_error_there(here, monkeypatch):
+    order = []
+
+    def warm_up(self):
+        time.sleep(2.0)
+        order.append("warm")
+        raise RuntimeError("left to the first use")
+
+    monkeypatch.setattr(Experiment, "warm_up", warm_up)
+    epoch = Program.epoch
+    monkeypatch.setattr(Program, "epoch", lambda self, state: order.append("epoch") or epoch(self, state))
+    trained("run", "--trainer.num_seeds", "6")
+    assert order[0] == "warm" and set(order[1:]) == {"epoch"}
+
+
+def test_on_a_gpu_programs_are_kept_unless_jax_is_told_where(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    name, folder = "jax_compilation_cache_dir", str(tmp_path / "star" / "jax")
+    before = jax.config.values[name]
+    try:
+        for backend, told, kept in (("cpu", None, None), ("gpu", "own", "own"), ("gpu", None, folder)):
+            jax.config.update(name, told)
+            monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+            select_device("auto")
+            assert jax.config.values[name] == kept
+    finally:
+        jax.config.update(name, before)
 
 
 def test_it_trains_and_goes_on_bit_for_bit(here):
