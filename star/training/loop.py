@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -50,10 +50,7 @@ class Result:
 
 
 class Loop:
-    """The part of a run that begins after the epoch `done`.
-
-    `compiled` waits until an epoch can run; `profile` says after which epoch to trace how many.
-    """
+    """The part of a run that begins after the epoch `done`; `profile` says after which epoch to trace how many."""
 
     def __init__(
         self,
@@ -63,7 +60,6 @@ class Loop:
         run_dir: Path,
         *,
         done: int,
-        compiled: Callable[[], object],
         stop: Stop,
         quiet: bool,
         console: Console,
@@ -74,7 +70,7 @@ class Loop:
         self._saved = done if checkpoints.steps() else -1
         self._spare: tuple[int, Any] | None = None
         """(epochs, state) before what may take long."""
-        self._compiled, self._stop = compiled, stop
+        self._stop = stop
         self._seen: dict[int, list[dict[str, Any]]] = {seed: [] for seed in program.seeds}
         """Of each seed what notices are drawn from, since this process began."""
         self._noted: set[tuple[int, str]] = set()
@@ -178,9 +174,10 @@ class Loop:
                     self._display.note(f"seed {seed}: {line}")
 
     def _compute(self, state: Any) -> tuple[Any, list[dict[str, Any]]]:
-        self._compiled()
-        state, metrics = self._program.epoch(state)
-        return state, of_epoch(metrics, self._program.seeds)
+        first = self._done == self._began and jax.process_count() == 1  # several would have to compile in one order
+        with self._program.preparing() if first else nullcontext():
+            state, metrics = self._program.epoch(state)
+            return state, of_epoch(metrics, self._program.seeds)
 
     def _evaluate(self, state: Any) -> Any:
         return jax.block_until_ready(self._program.evaluate(state, self._program.evaluation_keys(self._done)))

@@ -76,24 +76,20 @@ class Program:
         return self.functions.evaluate(self.hyper, state, keys)
 
     @contextmanager
-    def compiling(self) -> Iterator[Callable[[], object]]:
-        """All that a run needs compiles in threads while the body goes on, and Matplotlib is imported there.
+    def preparing(self) -> Iterator[None]:
+        """An epoch and the engine's kernels compile before the body; the evaluation may go on in a thread beside it.
 
-        A call of what is yielded waits until an epoch can run. Errors of each part are left to its first use.
+        Matplotlib is imported there, too. Errors of each part are left to its first use.
         """
-        pool, parts = ThreadPoolExecutor(), []
-        if jax.process_count() == 1:  # several would have to compile in one order
-            parts = [pool.submit(self._compile, pool), pool.submit(self.experiment.warm_up)]
-        try:
-            yield lambda: wait(parts)
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+        with ThreadPoolExecutor() as pool:
+            wait([pool.submit(self._compile, pool), pool.submit(self.experiment.warm_up)])
+            yield
 
     def _compile(self, pool: ThreadPoolExecutor) -> None:
         """Compile an epoch, and in other threads what is needed after it."""
-        epoch, evaluate = self.functions.epoch, self.functions.evaluate
-        traced = epoch.lower(self.hyper, self.data(), self.example())  # first of all: Python traces one at a time
-        pool.submit(lambda: evaluate.lower(self.hyper, self.example(), self.evaluation_keys(0)).compile())
+        epoch, evaluate, state = self.functions.epoch, self.functions.evaluate, self.example()
+        traced = epoch.lower(self.hyper, self.data(), state)  # first of all: Python traces one at a time
+        pool.submit(lambda: evaluate.lower(self.hyper, state, self.evaluation_keys(0)).compile())
         pool.submit(import_module, "matplotlib.figure")
         traced.compile()
 
@@ -162,7 +158,10 @@ def build(config: RunConfig) -> Program:
 
 
 def select_device(device: str) -> None:
-    """Make JAX use the device that `trainer.device` asks for; raises `UserError` if there is none."""
+    """Make JAX use the device that `trainer.device` asks for, and keep what it compiles for a GPU.
+
+    Raises `UserError` if there is none.
+    """
     if device == "cpu":
         jax.config.update("jax_platforms", "cpu")
     if device == "gpu" and jax.default_backend() != "gpu":
@@ -174,7 +173,7 @@ def select_device(device: str) -> None:
 
 
 def _keep_compiled() -> None:
-    """On GPUs keep compiled programs in the user's cache, for later runs, unless JAX is told where to, or not to."""
+    """For a GPU keep programs in the user's cache, for later runs, unless JAX is told where."""
     if jax.default_backend() == "gpu" and jax.config.values["jax_compilation_cache_dir"] is None:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(home / "star" / "jax"))

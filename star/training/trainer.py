@@ -53,7 +53,7 @@ def train(
         run_folder.make(run_dir)
     journal = Journal.of(run_dir, tables=program.kind.tables, muted=not first)
     alone = locked(run_dir, warn=warn) if first else nullcontext()
-    with interruptible() as stop, alone, closing(checkpoints), program.compiling() as compiled:
+    with interruptible() as stop, alone, closing(checkpoints):
         stop.patient = jax.process_count() > 1  # the others would wait for ever for one that leaves an epoch
         state, began = _begin(program, run_dir, checkpoints, journal, resume=resume, warn=warn)
         recorder = Recorder(program, journal)
@@ -61,8 +61,7 @@ def train(
             slowed, state = rollback.slowed(program, state, journal, env_steps=began)
             result = Loop(
                 slowed, recorder, checkpoints, run_dir,
-                done=_epochs(state), compiled=compiled, stop=stop, quiet=quiet, console=console,
-                profile=(traced, profile),
+                done=_epochs(state), stop=stop, quiet=quiet, console=console, profile=(traced, profile),
             ).run(state)  # fmt: skip
             fault = result.fault
             if fault is None or not rollback.goes_back(program, journal, fault, to=result.saved, warn=warn):
