@@ -75,12 +75,6 @@ class Star(Experiment):
         config = self.config
         return tuple(_demonstrations(config, one, self.env, self.test_env, self.spec) for one in config.sgim.teachers)
 
-    def warm_up(self) -> None:
-        """Step one environment with MJX-Warp, which compiles its kernels as they are first used."""
-        if self.config.env.engine == "warp":
-            still, key = jax.numpy.zeros(self.env.action_size), modes.key(0)
-            jax.block_until_ready(jax.jit(lambda key: self.env.step(self.env.reset(key), still).obs)(key))
-
     @over_seeds
     def init(self, hyper: AgentConfig, key: jax.Array) -> TrainState:
         """A fresh run."""

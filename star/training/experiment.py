@@ -88,9 +88,6 @@ class Experiment:
         """The data of an epoch besides the state; raises `UserError` before anything is written."""
         return ()
 
-    def warm_up(self) -> None:
-        """Compile what no jitted function compiles, such as an engine's kernels; called in a thread of its own."""
-
     def tables(self, hyper: Any, state: Any, seeds: Sequence[int]) -> list[dict[str, Any]]:
         """Rows to write down at an evaluation besides metrics, one a seed, or none."""
         return []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -175,9 +174,10 @@ class Loop:
 
     def _compute(self, state: Any) -> tuple[Any, list[dict[str, Any]]]:
         first = self._done == self._began and jax.process_count() == 1  # several would have to compile in one order
-        with self._program.preparing() if first else nullcontext():
-            state, metrics = self._program.epoch(state)
-            return state, of_epoch(metrics, self._program.seeds)
+        if first:
+            self._program.prepare()
+        state, metrics = self._program.epoch(state)
+        return state, of_epoch(metrics, self._program.seeds)
 
     def _evaluate(self, state: Any) -> Any:
         return jax.block_until_ready(self._program.evaluate(state, self._program.evaluation_keys(self._done)))

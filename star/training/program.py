@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
@@ -75,15 +74,14 @@ class Program:
         """The experiment's evaluation of each state, such as greedy episodes on test goals."""
         return self.functions.evaluate(self.hyper, state, keys)
 
-    @contextmanager
-    def preparing(self) -> Iterator[None]:
-        """An epoch and the engine's kernels compile before the body; the evaluation may go on in a thread beside it.
+    def prepare(self) -> None:
+        """Compile an epoch and the evaluation side by side; errors are left to each one's first use.
 
-        Matplotlib is imported there, too. Errors of each part are left to its first use.
+        Nothing may compile while an epoch runs: XLA tries kernels on the GPU, which breaks the CUDA graph that MJX-Warp
+        records at its first step ("capturing stream has unjoined work").
         """
         with ThreadPoolExecutor() as pool:
-            wait([pool.submit(self._compile, pool), pool.submit(self.experiment.warm_up)])
-            yield
+            wait([pool.submit(self._compile, pool)])
 
     def _compile(self, pool: ThreadPoolExecutor) -> None:
         """Compile an epoch, and in other threads what is needed after it."""

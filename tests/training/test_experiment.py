@@ -6,6 +6,7 @@ import re
 import shlex
 import shutil
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -22,7 +23,6 @@ from star.config.kinds import Measure
 from star.config.loading import parse
 from star.sweeps import work as working
 from star.training.checkpoint import Checkpoints
-from star.training.experiment import Experiment
 from star.training.journal import JsonLines
 from star.training.program import Program, select_device
 from tests.small import arrays
@@ -99,19 +99,23 @@ def test_the_evaluation_compiles_once_in_a_thread_beside_the_first_epoch(here, c
     assert len(threads) == 1 and threads[0].startswith("ThreadPool")
 
 
-def test_an_epoch_waits_for_what_warms_up_beside_it_and_minds_no_error_there(here, monkeypatch):
+def test_nothing_compiles_in_a_thread_while_the_first_epoch_runs_and_errors_there_are_left_to_the_first_use(
+    here, monkeypatch
+):
     order = []
+    evaluation_keys, epoch = Program.evaluation_keys, Program.epoch
 
-    def warm_up(self):
-        time.sleep(2.0)
-        order.append("warm")
-        raise RuntimeError("left to the first use")
+    def slow(self, epochs):
+        if threading.current_thread().name.startswith("ThreadPool"):
+            time.sleep(2.0)
+            order.append("evaluation")
+            raise RuntimeError("left to the first use")
+        return evaluation_keys(self, epochs)
 
-    monkeypatch.setattr(Experiment, "warm_up", warm_up)
-    epoch = Program.epoch
+    monkeypatch.setattr(Program, "evaluation_keys", slow)
     monkeypatch.setattr(Program, "epoch", lambda self, state: order.append("epoch") or epoch(self, state))
     trained("run", "--trainer.num_seeds", "6")
-    assert order[0] == "warm" and set(order[1:]) == {"epoch"}
+    assert order[0] == "evaluation" and set(order[1:]) == {"epoch"}
 
 
 def test_on_a_gpu_programs_are_kept_unless_jax_is_told_where(monkeypatch, tmp_path):
