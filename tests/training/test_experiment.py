@@ -89,7 +89,7 @@ def test_what_there_is_to_note_is_said_once_of_each_seed_unless_quiet_is_wanted(
     assert lines == [f"note: seed {seed}: ['bandit/error', 'env_steps'] since 7" for seed in range(5)]
 
 
-def test_the_evaluation_compiles_once_in_a_thread_beside_the_first_epoch(here, caplog):
+def test_the_evaluation_compiles_once_in_a_thread_before_the_first_epoch(here, caplog):
     jax.config.update("jax_log_compiles", True)
     try:
         trained("run", "--trainer.num_seeds", "7", "--trainer.eval_every", "10")
