@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 
 import envs
 from envs._quiet import Env, State
@@ -63,6 +64,11 @@ def whole(self, state, action):
     return after.replace(pipeline_state=(after.pipeline_state[0], jnp.zeros((), jnp.int32)))
 
 
+def listed(self, state, action):
+    after = Line.step(self, state, action)
+    return after.replace(pipeline_state=list(after.pipeline_state))
+
+
 def lost(self, state, action):
     return Line.step(self, state, action).replace(obs=jnp.full(3, jnp.nan))
 
@@ -109,6 +115,7 @@ WRONG = {
     "no state": (changed(reset=lambda self, rng: jnp.zeros(3)), "reset gives a"),
     "a leaf more": (changed(step=doubled), "step adds pipeline_state[2] to the state"),
     "a leaf of another type": (changed(step=whole), "step makes pipeline_state[1] int32 []; allowed: float32 []"),
+    "a list for a tuple": (changed(step=listed), "step changes the structure of the state"),
     "not a number": (changed(step=lost), "obs of step with an action of zeros is not finite"),
     "goals outside": (changed(reset=far), "a goal of reset has 11 in abstract dimension 0; allowed: inside the space"),
     "an error": (changed(reset=broken), "reset raises RuntimeError: no such robot (" + __file__),
@@ -122,6 +129,35 @@ def test_what_is_missing_or_wrong_is_named_in_one_line(case):
         envs.adapt(env, name="mine:make")
     assert str(error.value).startswith(f"mine:make: {words}")
     assert "\n" not in str(error.value)
+
+
+class Units:
+    """What a state may hold that is no number: equal to others, with an address in its text, as in MJX's data."""
+
+    def __eq__(self, other):
+        return isinstance(other, Units)
+
+    def __hash__(self):
+        return 0
+
+
+@struct.dataclass
+class Place:
+    place: jax.Array
+    clock: jax.Array
+    units: Units = struct.field(pytree_node=False)
+
+    def __iter__(self):
+        return iter((self.place, self.clock))
+
+
+def with_units(self, place, clock, goal):
+    return Line.at(self, place, clock, goal).replace(pipeline_state=Place(place, clock, Units()))
+
+
+def test_structures_are_compared_not_their_texts():
+    env = envs.adapt(changed(at=with_units), name="mine:units")
+    assert env.step(env.reset(jax.random.key(0)), jnp.zeros(1)).obs.shape == (3,)
 
 
 @pytest.fixture(scope="module")
