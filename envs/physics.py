@@ -25,6 +25,7 @@ import numpy as np
 from flax import struct
 from mujoco import rollout
 
+from envs import kernels
 from envs._quiet import mjx
 from envs.common import extras
 from envs.common.batching import flattened
@@ -83,7 +84,7 @@ class Physics:
     @cached_property
     def _step(self) -> StepBatch:
         with jax.ensure_compile_time_eval():  # the first use may be inside a function that is being traced
-            step = _ENGINES[self.engine](self.model, self.frames)
+            step = jax.jit(_ENGINES[self.engine](self.model, self.frames), inline=True)  # a batch is traced once
             return flattened(step if self.engine == "jax" else _without_derivatives(step, self.engine))
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
@@ -197,6 +198,7 @@ def _warp(model: mujoco.MjModel, frames: int) -> StepBatch:
     slides = int((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE).sum())
     contacts = CONTACTS + slides * SLIDE_CONTACTS
     rows = CONSTRAINT_ROWS + slides * 4 * SLIDE_CONTACTS
+    kernels.compile_beside(model, contacts=MIN_POOL, rows=rows)
 
     def overflow(full: mjx.Data) -> jax.Array:
         return ((full._impl.overflow & OVERFLOW_BITS) != 0).astype(jnp.float32)
