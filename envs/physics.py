@@ -36,6 +36,7 @@ CONTACTS = 24  # per environment; MJX-Warp pools them over the batch
 CONSTRAINT_ROWS = 96  # per environment, MJX-Warp
 SLIDE_CONTACTS = 8  # more of them for each slide joint, with 4 rows each
 MIN_POOL = 512  # contacts of a batch, however small
+LARGEST = 1e6  # coordinate or speed: beyond it float32 leaves out sixteenths, and learners square what they see
 OVERFLOW_BITS = 0b111111  # buffers of MJX-Warp that were too small: constraint rows, contacts, convex collisions
 
 _POOL = threading.Lock()  # mujoco.rollout has one thread pool for the process, and runs one rollout at a time
@@ -98,9 +99,11 @@ class Physics:
         )
 
     def step(self, data: PhysicsState, ctrl: jax.Array) -> PhysicsState:
-        """`dt` seconds under constant controls [nu]. A simulation that diverges turns non-finite, and remains so."""
+        """`dt` seconds under constant controls [nu]. A simulation that diverges turns to NaN, and remains so."""
         batch = self._step(*jax.tree.map(lambda leaf: leaf[None], (data, ctrl)))
-        return jax.tree.map(lambda leaf: leaf[0], batch)
+        after = jax.tree.map(lambda leaf: leaf[0], batch)
+        sound = jnp.all(jnp.abs(after.qpos) <= LARGEST) & jnp.all(jnp.abs(after.qvel) <= LARGEST)
+        return after.replace(qpos=jnp.where(sound, after.qpos, jnp.nan), qvel=jnp.where(sound, after.qvel, jnp.nan))
 
 
 def _without_derivatives(step: StepBatch, engine: str) -> StepBatch:

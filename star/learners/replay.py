@@ -78,7 +78,8 @@ def weighted_mean(x: Float[Array, "*n"], weight: Float[Array, "*n"]) -> Float[Ar
 def create(example: Any, *, size: int) -> Ring:
     """An empty ring of `size` items shaped like `example` (no leading axis)."""
     ring = _buffer(size, 1).init(example)
-    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), ring)  # a weakly typed index compiles twice
+    # flashbax leaves what was in the memory before, NaN too; and its index has a weak type, which compiles twice
+    return jax.tree.map(lambda x: jnp.zeros_like(x, dtype=x.dtype), ring)
 
 
 def add(ring: Ring, items: Any) -> Ring:

@@ -148,6 +148,17 @@ def test_a_simulation_that_explodes_turns_non_finite(body, tmp_path, monkeypatch
     assert np.isfinite(after.qpos[1]).all()
 
 
+@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("what", ["qpos", "qvel"])
+def test_a_simulation_that_leaves_the_world_turns_to_nan_before_its_numbers_overflow(engine, what):
+    physics = ant_body(engine).physics
+    qpos, qvel, ctrl = random_starts(physics.model, 2, floor=10.0)
+    {"qpos": qpos, "qvel": qvel}[what][0, 0] = 2e6
+    after = jax.jit(jax.vmap(physics.step))(simulations(physics, qpos, qvel), ctrl)
+    assert np.isnan(after.qpos[0]).all() and np.isnan(after.qvel[0]).all()
+    assert np.isfinite(after.qpos[1]).all() and np.isfinite(after.qvel[1]).all()
+
+
 def test_nested_vmaps_equal_one_flat_batch(body):
     qpos, qvel, ctrl = random_starts(body.physics.model, 6)
     data = simulations(body.physics, qpos, qvel)

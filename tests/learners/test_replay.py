@@ -1,6 +1,7 @@
 """Rings keep the latest items, and only what was written can be drawn."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -37,6 +38,12 @@ def test_a_ring_keeps_the_latest_items(add):
         history += items
         assert int(filled(ring)) == min(len(history), SIZE)
         assert written(ring) == history[-SIZE:]
+
+
+def test_a_new_ring_holds_nothing_of_what_was_in_the_memory_before(monkeypatch):
+    monkeypatch.setattr(jnp, "empty_like", lambda x, **_: jnp.full_like(x, jnp.nan))
+    ring = replay.create({"x": np.zeros(3, np.float32)}, size=SIZE)
+    assert np.array_equal(ring.experience["x"], np.zeros((1, SIZE, 3)))
 
 
 def test_a_batch_of_the_rings_size_replaces_everything(add):
