@@ -8,8 +8,7 @@
         all parts of i reach j:  edge i -> j, REACHES
         none does:               MISSES, until older than `miss_lifetime` epochs: the low levels are still learning
         some do:                 cut i along the axis that best parts the reaching from the missing leaves
-    where no cut is made, since none is possible or (`neighbours`) i and j do not touch, there is an edge if all parts
-    of i where agents have been reach j, else no verdict
+    where no cut is possible, there is an edge if all parts of i where agents have been reach j, else no verdict
 
 With `within`, pairs (i, i) are examined too: does a region reach the goals inside it? They count decisions of agents
 in i whose goal lies in i. One of their goals is drawn, if possible one that was reached, and the square inside its
@@ -186,8 +185,7 @@ def refine(
             transitions=graph.transitions.at[region, target].multiply(0.5 * inside),  # another goal may be drawn
         )
         mixed = judged & (verdict == MIXED)
-        near = inside | regions.adjacent(abstraction)[region, target] | (not config.refinement.neighbours)
-        abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed & near, key=cut_key)
+        abstraction, graph, splits = _cut(config, abstraction, graph, region, leaves, mixed, key=cut_key)
         verdict = jnp.where(mixed & ~splits.done.any() & reachability.reaches_where_visited(leaves), REACHES, verdict)
         recorded = (verdict == REACHES) | ((verdict == MISSES) & (config.refinement.miss_lifetime > 0))
         settled = judged & ~inside & recorded
@@ -376,8 +374,7 @@ def _cut(
     def one_cut(carry: tuple, cut_key: Array) -> tuple[tuple, Split]:
         abstraction, graph, parts = carry
         min_width = config.abstraction.min_width
-        candidates = parts & regions.coarse(abstraction, config.abstraction.min_share)
-        cut, gain = cutting.best_cut(abstraction, candidates, leaves, min_width=min_width)
+        cut, gain = cutting.best_cut(abstraction, parts, leaves, min_width=min_width)
         if config.refinement.cuts == "random":
             cut = cutting.random_cut(abstraction, cut.region, min_width=min_width, key=cut_key)
         abstraction, graph, split = _split(config, abstraction, graph, cut, wanted=mixed & (gain > 1e-6))

@@ -256,15 +256,6 @@ def split(abstraction: Abstraction, cut: Cut, *, min_width: float | Array) -> tu
     )
 
 
-def coarse(abstraction: Abstraction, share: float | Array) -> Bool[Array, "R"]:
-    """Mask of regions at least `share` times as large as each would be that is left, spread over the whole space.
-
-    The fewer are left, the larger they have to be; with none left, none is coarse but for a `share` of 0.
-    """
-    widths, space = abstraction.upper - abstraction.lower, abstraction.space[1] - abstraction.space[0]
-    return jnp.prod(widths / space, axis=-1) * (abstraction.capacity - abstraction.count) >= share
-
-
 def adjacent(abstraction: Abstraction) -> Bool[Array, "R R"]:
     """Mask of active regions that share a face; none is its own neighbour."""
     lower = jnp.maximum(abstraction.lower[:, None], abstraction.lower[None])

@@ -28,9 +28,6 @@ class AbstractionConfig(Section):
         unit="regions",
     )
     min_width: float = setting(1.0, "No region is cut narrower than this.", unit="units of the state", gt=0)
-    min_share: float = setting(
-        0.0, "No region smaller than this times the space, over the free places of the table, is cut.", unit="", ge=0
-    )
 
 
 class ForwardModelConfig(BufferedConfig):
@@ -54,9 +51,6 @@ class RefinementConfig(Section):
 
     enabled: bool = setting(True, "With false the initial regions stay.")
     within: bool = setting(True, "The reach of a region to the goals inside it is examined, too.")
-    neighbours: bool = setting(
-        True, "A region is cut only for targets that touch it; others are reached by way of these."
-    )
     min_transitions: Positive = setting(
         100, "A pair of regions is examined after so many commanded transitions.", unit="transitions"
     )

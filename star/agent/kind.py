@@ -47,7 +47,13 @@ STAR = Kind(
     migrations=TO_NEXT,
     harmless=("env.engine",),
     older={"tutor.straight": False, "refinement.separate": False},
-    gone=("commander.arrival", "commander.retry", "commander.trust"),
+    gone=(
+        "commander.arrival",
+        "commander.retry",
+        "commander.trust",
+        "refinement.neighbours",
+        "abstraction.min_share",
+    ),
     anywhere={"env.engine": "auto"},
     commands={
         "evaluate": lazily("star.agent.commands:evaluate"),

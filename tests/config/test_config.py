@@ -80,7 +80,7 @@ def test_a_misspelt_key_names_the_nearest_valid_one(write, text, wrong, nearest)
 
 def test_a_key_like_no_other_lists_those_of_its_section(write):
     message = refusal(write("abstraction: {zzz: 1}"))
-    assert message.endswith("abstraction.zzz: unknown key (allowed: max_regions, cuts, grid, min_width, min_share)")
+    assert message.endswith("abstraction.zzz: unknown key (allowed: max_regions, cuts, grid, min_width)")
 
 
 @pytest.mark.parametrize(
