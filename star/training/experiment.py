@@ -45,26 +45,20 @@ def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(function)
     def lifted(self: Any, hyper: Any, *args: Any) -> Any:
         axes = (_axis(hyper), *(None if name == "data" else 0 for name in names))
-        return _mapped(partial(function, self), axes)(hyper, *args)
+        return _mapped(partial(function, self), axes, (hyper, *args))
 
     return lifted
 
 
-def _mapped(function: Callable[..., Any], axes: Sequence[int | None]) -> Callable[..., Any]:
-    """`jax.vmap` over the first axis where `axes` says 0. A single seed has no vmap, which traces all loops twice."""
-
-    def call(*args: Any) -> Any:
-        mapped = [arg for arg, axis in zip(args, axes, strict=True) if axis is not None]
-        if {leaf.shape[0] for leaf in jax.tree.leaves(mapped)} != {1}:
-            return jax.vmap(function, in_axes=tuple(axes))(*args)
-        firsts = [arg if axis is None else _first(arg) for arg, axis in zip(args, axes, strict=True)]
-        return jax.tree.map(lambda leaf: leaf[None], function(*firsts))
-
-    return call
-
-
-def _first(tree: Any) -> Any:
-    return jax.tree.map(lambda leaf: leaf[0], tree)
+def _mapped(function: Callable[..., Any], axes: tuple[int | None, ...], args: tuple[Any, ...]) -> Any:
+    """`function` over the first axis of the `args` where `axes` says 0; of one seed without vmap, which traces twice."""
+    mapped = [arg for arg, axis in zip(args, axes, strict=True) if axis is not None]
+    if {leaf.shape[0] for leaf in jax.tree.leaves(mapped)} != {1}:
+        return jax.vmap(function, in_axes=axes)(*args)
+    firsts = [
+        arg if axis is None else jax.tree.map(lambda leaf: leaf[0], arg) for arg, axis in zip(args, axes, strict=True)
+    ]
+    return jax.tree.map(lambda leaf: leaf[None], function(*firsts))
 
 
 def numbers(evaluated: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
