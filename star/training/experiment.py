@@ -51,7 +51,7 @@ def over_seeds(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _mapped(function: Callable[..., Any], axes: tuple[int | None, ...], args: tuple[Any, ...]) -> Any:
-    """`function` over the first axis of the `args` where `axes` says 0; of one seed without vmap, which traces twice."""
+    """`function` over the first axis of the `args` where `axes` says 0. vmap traces loops twice: one seed has none."""
     mapped = [arg for arg, axis in zip(args, axes, strict=True) if axis is not None]
     if {leaf.shape[0] for leaf in jax.tree.leaves(mapped)} != {1}:
         return jax.vmap(function, in_axes=axes)(*args)
