@@ -53,6 +53,20 @@ def test_a_script_takes_from_modules_only_what_they_have(name):
     assert [f"{module}.{attr}" for module, attr in used if not hasattr(modules[module], attr)] == []
 
 
+@pytest.mark.parametrize("held", [None, "", "/there:/elsewhere"])
+def test_what_a_script_starts_finds_packages_where_the_script_found_them(tmp_path, monkeypatch, held):
+    monkeypatch.setenv("PYTHONPATH", held or "")
+    if held is None:
+        monkeypatch.delenv("PYTHONPATH")
+    wanted = f"{tmp_path}:{held}" if held else str(tmp_path)  # an empty entry would be the current folder
+    assert load("processes").importing(tmp_path) == {"PYTHONPATH": wanted}
+
+
+def test_scripts_set_the_path_of_packages_in_one_way():
+    others = {name for name in FILES if '"PYTHONPATH":' in (SCRIPTS / f"{name}.py").read_text()}
+    assert others == {"processes", "checks/wheel"}  # a wheel is tried with nothing else
+
+
 def test_the_periods_of_an_agent_are_told_with_the_regions_that_hold_its_places(run, capsys):
     script = load("checks/periods")
     script.main([str(run), "--seed", "6", "--episodes", "3", "--commands", "2"])

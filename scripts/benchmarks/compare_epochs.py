@@ -19,6 +19,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from scripts.processes import importing
+
 WORKER = """
 import json, sys, time
 import jax
@@ -95,7 +97,7 @@ class Worker:
 
     def __init__(self, checkout: Path, config: Path, overrides: dict[str, Any]) -> None:
         """Start it; both share the memory of a GPU."""
-        here = {"PYTHONPATH": os.pathsep.join([str(checkout.resolve()), os.environ.get("PYTHONPATH", "")])}
+        here = importing(checkout)
         here["XLA_PYTHON_CLIENT_MEM_FRACTION"] = os.environ.get("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.42")
         command = [sys.executable, "-c", WORKER, str(config), json.dumps(overrides)]
         self._process = subprocess.Popen(

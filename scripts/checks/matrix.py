@@ -32,6 +32,8 @@ from typing import Any
 
 import numpy as np
 
+from scripts.processes import importing
+
 ROOT = Path(__file__).parents[2]
 Table = dict[str, dict[str, str]]
 WORKS = "works"
@@ -219,9 +221,7 @@ def outcome(use: Callable[[], Any]) -> str:
 def in_mode(mode: str, objects: Sequence[str] = tuple(OBJECTS)) -> dict[str, str]:
     """The outcome of each object in a process of its own in that mode."""
     variables, flags = MODES[mode]
-    environment = (
-        os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])} | variables
-    )
+    environment = os.environ | importing(ROOT) | variables
     words = [sys.executable, *flags, str(Path(__file__)), "--objects", *objects]
     try:
         done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=LIMIT, check=False)

@@ -19,6 +19,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from scripts.processes import importing
+
 ROOT = Path(__file__).parents[2]
 LIMIT = 300  # s, of one test: some faults are that something hangs
 
@@ -379,8 +381,9 @@ def copy(tree: Path) -> None:
 def passes(test: str, tree: Path) -> bool:
     """True if pytest passes there: no less than one test, and none fails. A test that hangs fails."""
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", test]
-    environment = os.environ | {
-        "PYTHONPATH": str(tree),
+    environment = {
+        **os.environ,
+        **importing(tree),
         "PYTHONDONTWRITEBYTECODE": "1",
         "MUJOCO_GL": "",  # EGL where there is one: with OSMesa any thread can draw at any time
     }

@@ -41,6 +41,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from scripts.processes import importing
+
 FOLDERS = ("agents", "ablations", "sgim")  # of configs/, whose files are layers
 EPOCHS, FRESH, FROM = 5, 4, 2  # that OLD trains; after which both are compared; after which NEW goes on
 METRICS = 1e-6  # how far metrics may be apart
@@ -302,8 +304,7 @@ class Commands(NamedTuple):
         arguments = [str(word) for word in words]
         for key, value in (settings | {"trainer.total_env_steps": self.steps(epochs)}).items():
             arguments += [f"--{key}", value if isinstance(value, str) else json.dumps(value)]
-        here = {
-            "PYTHONPATH": str(checkout),
+        here = importing(checkout) | {
             "JAX_PLATFORMS": "cpu",
             "MUJOCO_GL": "disable",
             "XLA_FLAGS": os.environ.get("XLA_FLAGS", HASTY),

@@ -34,6 +34,7 @@ from typing import Any
 
 import jax
 
+from scripts.processes import importing
 from star.cli.words import split_settings
 from star.config.loading import load
 from star.training import provenance, trainer
@@ -78,7 +79,7 @@ class Soak:
         self.folder = folder
         self.chance = random.Random(seed)
         cache = {"JAX_COMPILATION_CACHE_DIR": str(folder / "jax"), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-        self._environment = os.environ | cache | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+        self._environment = os.environ | cache | {"JAX_PLATFORMS": "cpu"} | importing(ROOT)
 
     def start(self, run: Path) -> subprocess.Popen:
         """Begin the run, or go on with it, as a job of a cluster would."""

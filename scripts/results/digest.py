@@ -26,6 +26,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from scripts.processes import importing
+
 ROOT = Path(__file__).parents[2]
 EPOCHS = 3
 CLOSE = 0.005  # of `moved`
@@ -40,8 +42,7 @@ def of(command: str) -> dict[str, Any]:
     Seeds of the command do not matter. Raises `subprocess.CalledProcessError` if this code no longer takes it.
     """
     words = shlex.split(command)[2:]
-    here = {"JAX_PLATFORMS": "cpu", "MUJOCO_GL": "disable", "PYTHONPATH": str(ROOT)}
-    here["XLA_FLAGS"] = HASTY
+    here = importing(ROOT) | {"JAX_PLATFORMS": "cpu", "MUJOCO_GL": "disable", "XLA_FLAGS": HASTY}
     script = [sys.executable, str(Path(__file__)), *words]
     done = subprocess.run(script, cwd=ROOT, env=os.environ | here, capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout.splitlines()[-1]))
