@@ -359,7 +359,6 @@ def recording(request, breaking_env):
         "tutor.straight": not published,
         "tutor.reward_scale": 0.1,
         "controller.reward_scale": 0.5,
-        "commander.practice": 0.6,
         "commander.epsilon_start": 0.5,
         "commander.epsilon_spread": False,
     }
@@ -371,7 +370,7 @@ def recording(request, breaking_env):
         # Greedy choices often fall on the goal's own region.
         eye = jnp.eye(state.abstraction.capacity)
         q = jnp.broadcast_to(eye, state.commander.q.shape)
-        known = state.commander.replace(q=q, model=state.commander.model.replace(reach=q))
+        known = state.commander.replace(q=q)
         state = state.replace(commander=known)
         return state.abstraction, record(agent, spec, breaking_env, state, key)
 

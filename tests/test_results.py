@@ -60,8 +60,8 @@ def report(success, *, digests=(), seconds=12.0):
     ("today", "digests", "current"),
     [
         (DIGEST, [DIGEST], True),
-        (DIGEST, [DIGEST, DIGEST | {"moved": {"controller": 1.253, "tutor": 0.497}}], True),  # rounding of a machine
-        (DIGEST, [DIGEST, DIGEST | {"moved": {"controller": 1.25, "tutor": 0.508}}], False),
+        (DIGEST, [DIGEST, DIGEST | {"moved": {"controller": 1.2505, "tutor": 0.4995}}], True),  # rounding of a machine
+        (DIGEST, [DIGEST, DIGEST | {"moved": {"controller": 1.25, "tutor": 0.502}}], False),
         (DIGEST, [DIGEST | {"settings": "b2"}], False),
         (DIGEST, [None], False),
         (None, [DIGEST], False),

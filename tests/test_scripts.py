@@ -441,20 +441,22 @@ def test_verdicts_are_compared_with_what_rollouts_did(tiny, breaking_env, fresh,
     agent, state = loading.parse({**tiny, "abstraction": four_regions}).hyper(), fresh(abstraction=four_regions)
     verdict = state.graph.verdict.at[0, 1].set(REACHES).at[1, 0].set(MISSES)
     state = state.replace(graph=state.graph.replace(verdict=verdict))
-    # (region, target, next region): 0 -> 1 is right in 3 of 4 rollouts, 1 -> 0 in 1 of 2, and one does not count.
+    # (region, target, next region): 0 -> 1 is right in 3 of 4 rollouts, 1 -> 0 in 1 of 2. One does not count, one is
+    # at the goal, one stays.
     seen = np.array([(0, 1, 1), (0, 1, 1), (0, 1, 1), (0, 1, 0), (1, 0, 1), (1, 0, 0), (2, 3, 2), (0, 1, 0), (2, 2, 2)])
     region, target, next_region = seen.T
     weight = np.array([1, 1, 1, 1, 1, 1, 1, 0, 1], np.float32)
     point = np.zeros((9, 2), np.float32)
-    unused = dict.fromkeys(("goal_region", "reward", "lost", "practised", "aside", "goal"))
-    decision = Decision(region=region, target=target, next_region=next_region, weight=weight, **unused)
+    unused = dict.fromkeys(("reward", "lost", "goal"))
+    where = {"region": region, "target": target, "next_region": next_region, "goal_region": np.full(9, 3)}
+    decision = Decision(**where, weight=weight, aside=np.zeros(9, np.float32), **unused)
     outcome = Outcome(start=point, lower=point, upper=point, end=point + 3, weight=weight)
     walls = np.array([[2.0, -99.0, 7.5, 99.0]])
     finished = dict.fromkeys(("reaches", "misses", "all"), (decision, outcome))
     row = script.judge(agent, spec, state, finished, walls)
     assert row["reaches"] == {"share": 0.75, "rollouts": 4, "pairs": 1}
     assert row["misses"] == {"share": 0.5, "rollouts": 2, "pairs": 1}
-    assert row["base"]["rollouts"] == 7 and row["error"]["still"] == pytest.approx(18**0.5)
+    assert row["base"]["rollouts"] == 6 and row["error"]["still"] == pytest.approx(18**0.5)
     assert row["walls"]["share"] == 0.5  # of 4 faces, 2 at x = 8 beside the wall's side at 7.5 and 2 at y = 8
 
 

@@ -49,9 +49,7 @@ def rollouts(
 
     Commands are drawn from `pairs` [R, R]; from a region that has none there, from all regions.
     """
-    section = config.commander.model_copy(
-        update={"epsilon_start": 1.0, "epsilon_end": 1.0, "epsilon_spread": False, "practice": 1.0}
-    )  # all practise, so that targets are regions, never goals
+    section = config.commander.model_copy(update={"epsilon_start": 1.0, "epsilon_end": 1.0, "epsilon_spread": False})
     agent = levels.of(config.model_copy(update={"commander": section}), spec, greedy=True)
     active = state.abstraction.active[:, None] & state.abstraction.active[None, :]
     chosen = jnp.where(pairs.any(axis=1, keepdims=True), pairs, active)
@@ -119,8 +117,8 @@ def near_walls(state: TrainState, walls: np.ndarray, space: np.ndarray) -> dict[
 
 
 def _complete(decision: Decision) -> np.ndarray:
-    """Mask of the decisions that lasted k env steps and aimed at another region."""
-    return (decision.weight > 0) & (decision.region != decision.target)
+    """Mask of the decisions that lasted k env steps and aimed at another region, not at the goal in it."""
+    return (decision.weight > 0) & (decision.region != decision.target) & ~decision.at_goal
 
 
 def _flat(x: jax.Array) -> np.ndarray:

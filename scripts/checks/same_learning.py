@@ -152,7 +152,6 @@ ROWS: dict[str, Row] = {
     "ablations/no_heading": Row("ant_maze_cam", ANT),
     "ablations/no_mask": Row(),
     "ablations/no_passages": Row(),
-    "ablations/no_practice": Row(),
     "ablations/no_refinement": Row(),
     "ablations/no_straight": Row(),
     "ablations/one_box": Row(),

@@ -225,9 +225,8 @@ def _begin(
 ) -> tuple[TrainState, Roadmap, Memory, Array]:
     """The state as it acts, its roadmap, the memory at the start, and the keys of all segments."""
     agent, segments = levels.of(config, spec, greedy=True), spec.episode_length // config.tutor.period
-    begin_key, keys = hierarchy.segment_keys(key, segments)
-    memory = agent.commander.begin(config.commander, spec.abstract(obs), greedy=True, key=begin_key)
-    return *hierarchy.prepare(agent, state), memory, keys
+    _, keys = hierarchy.segment_keys(key, segments)
+    return *hierarchy.prepare(agent, state), agent.commander.begin(spec.abstract(obs)), keys
 
 
 @partial(jax.jit, static_argnames="spec")  # agents of one kind share it

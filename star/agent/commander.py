@@ -7,9 +7,6 @@
     observe     the decisions of an instant, by `planning` or `q_learning`
     follow      once an epoch: the regions may have been cut
 
-A share of the environments practises: they pursue random regions instead of the goal. Goals hard to reach, and so
-unattractive to all others, are tried there.
-
 Greedy episodes explore nothing, and follow a plan of their own (`settle`).
 
 Source: STAR (ICLR 2024), section 4.1.
@@ -20,7 +17,6 @@ from __future__ import annotations
 from functools import partial
 from types import ModuleType
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -29,7 +25,7 @@ from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.regions import Box, Change, Places
 from star.agent import planning, q_learning, values
-from star.agent.decisions import ANY, Decision, Finished, Memory, Roadmap, Scene, target_box
+from star.agent.decisions import Decision, Finished, Memory, Roadmap, Scene, target_box
 from star.agent.sections import CommanderConfig
 from star.agent.segments import Segment
 from star.agent.task import Task
@@ -70,21 +66,11 @@ def spread(section: CommanderConfig, share: Float[Array, ""], *, num_envs: int) 
     return share + section.epsilon_spread * even * jnp.minimum(share, 1 - share)
 
 
-def begin(section: CommanderConfig, position: Float[Array, "B d"], *, greedy: bool, key: Array) -> Memory:
-    """Clocks at 0, in a share `practice` of the environments to practise; in `greedy` episodes nobody does."""
-    memory = blank(position)
-    if greedy:
-        return memory
-    practising = jax.random.uniform(key, (len(position),)) < section.practice
-    return memory.replace(practice=jnp.where(practising, ANY, -1))
-
-
-def blank(position: Float[Array, "B d"]) -> Memory:
-    """Clocks at 0, nobody practises."""
+def begin(position: Float[Array, "B d"]) -> Memory:
+    """Clocks at 0."""
     nothing = jnp.zeros(len(position), jnp.int32)
     return Memory(
         clock=nothing,
-        practice=nothing - 1,
         region=nothing,
         goal_region=nothing,
         target=nothing,
@@ -110,29 +96,24 @@ def command(
     """The decision of those whose clock is 0; greedy where `env_steps`, those of all environments so far, is None."""
     locate = partial(regions.locate, roadmap.abstraction)
     region, goal_region = locate(scene.position), locate(scene.goal)
-    act_key, practice_key = jax.random.split(key)
-    another = jax.random.randint(practice_key, memory.practice.shape, 0, roadmap.abstraction.count)
-    practice = jnp.where((memory.practice == region) | (memory.practice == ANY), another, memory.practice)
     target = values.choose(
         state,
         roadmap.allowed,
         region,
         goal_region,
-        practised=practice,
         attraction=roadmap.attraction,
         epsilon=_shares(section, env_steps, num_envs=len(region)),
-        key=act_key,
+        key=key,
     )
     if section.hold:
         there = region == goal_region if section.hold == "region" else scene.success > 0
-        target = jnp.where(there & (practice < 0), goal_region, target)
-    aim, aside = scene.goal, jnp.zeros_like(practice, bool)
+        target = jnp.where(there, goal_region, target)
+    aim, aside = scene.goal, jnp.zeros_like(region, bool)
     if marks.way is not None:
         aside, aim = marks.way.aside, jnp.where(marks.way.aside[:, None], marks.way.point, aim)
         target = jnp.where(marks.way.target >= 0, marks.way.target, target)
-    around = aside | ((target == goal_region) & (practice < 0))
+    around = aside | (target == goal_region)
     fresh = memory.replace(
-        practice=practice,
         region=region,
         goal_region=goal_region,
         target=target,
@@ -177,7 +158,6 @@ def experience(
         next_region=regions.locate(roadmap.abstraction, end),
         weight=weight,
         lost=lost,
-        practised=(memory.practice >= 0).astype(weight.dtype),
         aside=memory.aside.astype(weight.dtype),
         goal=task.spec.goal_point(segment.obs[0]),
         shown=None if marks.shown is None else marks.shown.astype(weight.dtype),
@@ -250,7 +230,7 @@ def plan(section: CommanderConfig, state: CommanderState, roadmap: Roadmap) -> C
 
 def measure(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, batch: Decision) -> Metrics:
     """Mean reward of the whole periods in `batch` and their mean absolute error of temporal difference."""
-    weight = batch.weight * values.towards_goals(batch)
+    weight = batch.weight * (1 - batch.aside)
     error = values.td_error(section, state, roadmap.allowed, batch)
     return {"reward": weighted_mean(batch.reward, weight), "td_error": weighted_mean(jnp.abs(error), weight)}
 

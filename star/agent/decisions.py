@@ -19,16 +19,12 @@ from star.abstraction.regions import Abstraction, Box, Near
 from star.agent.sections import CommanderConfig
 from star.agent.task import Task
 
-ANY = 1_000_000  # a region to practise that is still to be drawn; larger than any index
-
 
 class Memory(struct.PyTreeNode):
     """State of each of the B environments in its Commander period."""
 
     clock: Int[Array, "B"]
     """Env steps since the period began."""
-    practice: Int[Array, "B"]
-    """The region that an environment practises to reach; -1 where it pursues the goal of the task."""
     region: Int[Array, "B"]
     """Region in which the period began."""
     goal_region: Int[Array, "B"]
@@ -44,9 +40,8 @@ class Decision(struct.PyTreeNode):
     """Finished periods of N streams.
 
     `weight` is 1 where the period really lasted k env steps, `lost` is 1 where the task was terminated in it,
-    `practised` is 1 where a random region was pursued instead of the goal, `aside` is 1 where what was commanded was a
-    waypoint, which tells nothing of its region, and `shown` is 1 where a teacher chose the target. The reward is that
-    for the goal, which was at the point `goal`.
+    `aside` is 1 where what was commanded was a waypoint, which tells nothing of its region, and `shown` is 1 where a
+    teacher chose the target. The reward is that for the goal, which was at the point `goal`.
     """
 
     region: Int[Array, "N"]
@@ -56,7 +51,6 @@ class Decision(struct.PyTreeNode):
     next_region: Int[Array, "N"]
     weight: Float[Array, "N"]
     lost: Float[Array, "N"]
-    practised: Float[Array, "N"]
     aside: Float[Array, "N"]
     goal: Float[Array, "N d"]
     shown: Float[Array, "N"] | None = None
@@ -64,7 +58,7 @@ class Decision(struct.PyTreeNode):
     @property
     def at_goal(self) -> Bool[Array, "N"]:
         """True if the Tutor was given the goal, not the bounds of a region."""
-        return (self.target == self.goal_region) & (self.practised == 0) & (self.aside == 0)
+        return (self.target == self.goal_region) & (self.aside == 0)
 
 
 class Finished(NamedTuple):
@@ -86,7 +80,7 @@ class Scene(NamedTuple):
 class Successors(struct.PyTreeNode):
     """Mask of the targets that may follow a region: `greedy` for the best choice, `explore` for the random one.
 
-    Besides, the region of a goal, or one that is practised, may always follow itself.
+    Besides, the region of a goal may always follow itself.
     """
 
     near: Near

@@ -30,7 +30,6 @@ from star.agent.play import Episode, Streams
 from star.agent.sections import AgentConfig
 from star.agent.segments import Segment
 from star.agent.state import TrainState
-from star.learners.replay import weighted_mean
 from star.sgim.teachers import Demonstrations
 from star.spec import Spec
 
@@ -58,9 +57,8 @@ def epoch(
     env_steps = state.epoch.astype(jnp.float32) * (spec.episode_length * env.num_envs)
     known = state.commander
     streams = devices.share(play.start(agent, env, key=reset_key))
-    taught = streams.memory.practice < 0
     lesson, env_state, graph = guide.begin(
-        config.sgim, spec, env, state.sgim, state.graph, teachers, streams.env, taught=taught, key=lesson_key
+        config.sgim, spec, env, state.sgim, state.graph, teachers, streams.env, key=lesson_key
     )
     state, streams = state.replace(graph=graph, key=key), streams.replace(env=env_state, lesson=lesson)
     attraction = guide.attraction(config.sgim, state.sgim)
@@ -73,7 +71,7 @@ def epoch(
         (jax.random.split(scan_key, blocks[0]), jnp.arange(segments).reshape(blocks)),
     )
     metrics = jax.tree.map(jnp.mean, metrics) | jax.tree.map(jnp.sum, counts)
-    metrics |= _episode_metrics("train", streams.episode, (streams.memory.practice < 0).astype(jnp.float32))
+    metrics |= _episode_metrics("train", streams.episode)
     learnt, more = guide.end(config.sgim, spec, state.sgim, streams.lesson, distance=streams.episode.distance)
     state, metrics = state.replace(sgim=learnt), metrics | _prefix("sgim", more)
     if state.adjacency is not None:
@@ -167,12 +165,12 @@ def _counts(passed: Segment) -> Metrics:
     return {f"env/{name}": (value * passed.alive).sum() for name, value in counted.items()}
 
 
-def _episode_metrics(name: str, episode: Episode, weight: Array) -> Metrics:
+def _episode_metrics(name: str, episode: Episode) -> Metrics:
     return {
-        f"{name}/success_any": weighted_mean(episode.success_any, weight),
-        f"{name}/success_final": weighted_mean(episode.success_final, weight),
-        f"{name}/distance": weighted_mean(episode.distance, weight),
-        f"{name}/return": weighted_mean(episode.total, weight),
+        f"{name}/success_any": episode.success_any.mean(),
+        f"{name}/success_final": episode.success_final.mean(),
+        f"{name}/distance": episode.distance.mean(),
+        f"{name}/return": episode.total.mean(),
     }
 
 

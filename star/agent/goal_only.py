@@ -5,22 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
 from envs.common.batching import where
 from star.abstraction import regions
-from star.agent.commander import blank, init, tick
+from star.agent.commander import begin, init, tick
 from star.agent.decisions import Finished, Memory, Roadmap, Scene, target_box
 from star.agent.sections import CommanderConfig
 from star.agent.segments import Segment
 from star.agent.task import Task
 
 __all__ = ["begin", "command", "experience", "init", "observe", "renewed", "settle", "tick"]
-
-
-def begin(section: CommanderConfig, position: Float[Array, "B d"], *_: Any, **__: Any) -> Memory:
-    """Nobody practises: there is nobody to send them."""
-    return blank(position)
 
 
 def command(

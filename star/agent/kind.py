@@ -49,6 +49,7 @@ STAR = Kind(
     older={"tutor.straight": False, "refinement.separate": False},
     gone=(
         "commander.arrival",
+        "commander.practice",
         "commander.retry",
         "commander.trust",
         "refinement.neighbours",

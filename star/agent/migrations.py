@@ -12,7 +12,7 @@ import numpy as np
 from star.config.kinds import Arrays, Migration
 from star.learners.sections import TD3Config
 
-FORMAT = 6  # since TD3 sees normalised observations, and rewards in running units
+FORMAT = 7  # since nobody practises to reach random regions
 
 
 def _count_for_both_aims(arrays: Arrays) -> Arrays:
@@ -57,9 +57,15 @@ def _observations_as_they_are(arrays: Arrays) -> Arrays:
     return arrays | new
 
 
+def _no_values_of_practice(arrays: Arrays) -> Arrays:
+    """The Commander had a second table of values, for environments that practised to reach random regions."""
+    return {name: x for name, x in arrays.items() if name != "commander/model/reach"}
+
+
 TO_NEXT: Mapping[int, Migration] = {
     2: Migration(),  # the same, in other files and without checksums
     3: Migration(arrays=_count_for_both_aims),
     4: Migration(arrays=_returns_as_they_are),
     5: Migration(arrays=_observations_as_they_are),
+    6: Migration(arrays=_no_values_of_practice),
 }

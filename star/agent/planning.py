@@ -13,8 +13,6 @@ region gets there. This belief weighs `prior` decisions, and e^(-n / prior) of t
 regions, the epoch's decisions are counted anew by today's regions, and older ones are shared out by where periods began
 and ended (`follow`). Greedy episodes, in which nothing is learnt, follow a plan with hardly any belief (`settle`).
 
-Those who practise pursue a region by the same plan with another reward, 1 in the region pursued.
-
 Source: optimistic model, R-max (Brafman and Tennenholtz 2002).
 """
 
@@ -41,7 +39,7 @@ def init(*, regions: int, near: int) -> Model:
     """Nothing counted."""
     cube = jnp.zeros((regions, near, near))
     both = jnp.stack([cube, cube])
-    return Model(led=both, rewards=cube, visits=cube, lost=both[:, :, 0], reach=jnp.zeros((regions, regions, near)))
+    return Model(led=both, rewards=cube, visits=cube, lost=both[:, :, 0])
 
 
 def observe(
@@ -55,26 +53,18 @@ def plan(
     section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, due: Bool[Array, ""] | None = None
 ) -> CommanderState:
     """Values by what is known now, where it is `due` (None: now)."""
-    model = _model(state)
-    now, as_it_is = partial(_plan, section, roadmap, state), (state.q, model.reach)
-    q, reach = now() if due is None else jax.lax.cond(due, now, lambda: as_it_is)
-    return state.replace(q=q, model=model.replace(reach=reach))
+    now = partial(_plan, section, roadmap, state)
+    return state.replace(q=now() if due is None else jax.lax.cond(due, now, lambda: state.q))
 
 
-def _plan(
-    section: CommanderConfig, roadmap: Roadmap, state: CommanderState
-) -> tuple[Float[Array, "R R S"], Float[Array, "R R S"]]:
-    """Q and `reach` by `section.sweeps` sweeps of value iteration on the model, from the values of last time.
+def _plan(section: CommanderConfig, roadmap: Roadmap, state: CommanderState) -> Float[Array, "R R S"]:
+    """Q by `section.sweeps` sweeps of value iteration on the model, from the values of last time.
 
     As long as nothing is known, region j is held reachable from i where `believed` [i, j], and who aims at a goal in
     his own region is taken to succeed (or, with rewards that are negative, to lose nothing anywhere).
     """
-    model = _model(state)
-    chances, reward = _expectations(section, model, roadmap, belief=1.0)
-    pursued = jnp.broadcast_to(jnp.eye(state.chosen.shape[0])[..., None], reward.shape)
-    tables, rewards = jnp.stack([state.q, model.reach]), jnp.stack([reward, pursued])
-    q, reach = _iterated(section, roadmap.allowed, tables, rewards, chances, sweeps=section.sweeps)
-    return q, reach
+    chances, reward = _expectations(section, _model(state), roadmap, belief=1.0)
+    return _iterated(section, roadmap.allowed, state.q, reward, chances, sweeps=section.sweeps)
 
 
 def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, periods: int) -> CommanderState:
@@ -87,8 +77,8 @@ def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *,
     if section.reward != "success":
         return state
     chances, reward = _expectations(section, _model(state), roadmap, belief=_HUNCH)
-    q = _iterated(section, roadmap.allowed, jnp.zeros_like(state.q)[None], reward[None], chances, sweeps=periods)[0]
-    return state.replace(q=q)
+    nothing = jnp.zeros_like(state.q)
+    return state.replace(q=_iterated(section, roadmap.allowed, nothing, reward, chances, sweeps=periods))
 
 
 def fade(section: CommanderConfig, state: CommanderState) -> Model:
@@ -127,8 +117,7 @@ def follow(
         goal_region=goal_region,
         target=jnp.where(decision.at_goal, goal_region, decision.target),
     )
-    model = recounted(section, earlier, decision, cells, places, traffic)
-    return model.replace(reach=values.inherited(_model(state).reach, places))
+    return recounted(section, earlier, decision, cells, places, traffic)
 
 
 def recounted(
@@ -139,7 +128,7 @@ def recounted(
     places: Places,
     traffic: Float[Array, "R R"],
 ) -> Model:
-    """The `earlier` model and the decisions of `batch`, but for `reach`.
+    """The `earlier` model and the decisions of `batch`.
 
     `cells` holds them with today's regions, but for the targets, which count as all their parts unless they were goals.
     """
@@ -166,9 +155,7 @@ def _counted(near: Near, model: Model, batch: Decision, *, cells: Decision) -> M
     What led to a region that is not near has no cell and is not counted.
     """
     direct = 1 - batch.aside
-    # Practising agents aim at the centre of the goal's region, which tells nothing of aiming at the goal.
-    beside = batch.practised * (batch.target == batch.goal_region)
-    telling = jnp.maximum(batch.weight, batch.lost) * direct * (1 - beside)
+    telling = jnp.maximum(batch.weight, batch.lost) * direct
     place = lambda region: near.place[cells.region, region]  # noqa: E731
     command = (batch.at_goal.astype(jnp.int32), cells.region, place(cells.target))
     pursuit = (cells.region, place(cells.goal_region), place(cells.target))
@@ -215,25 +202,24 @@ def _weight_of_belief(section: CommanderConfig, number: Float[Array, "*n"]) -> F
 def _iterated(
     section: CommanderConfig,
     allowed: Successors,
-    tables: Float[Array, "V R R S"],
-    rewards: Float[Array, "V R R S"],
+    q: Float[Array, "R R S"],
+    reward: Float[Array, "R R S"],
     chances: Float[Array, "2 R S S"],
     *,
     sweeps: int,
-) -> Float[Array, "V R R S"]:
-    """The `tables` of values after sweeps of value iteration, each with its rewards; the first is that of goals."""
+) -> Float[Array, "R R S"]:
+    """The values `q` after sweeps of value iteration."""
     (to_region, to_goal), near = chances, allowed.near.region
     product = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
     at_goal = near[:, None] == jnp.arange(len(near))[None, :, None]
 
-    def sweep(tables: Array, _: None) -> tuple[Array, None]:
-        future = jax.vmap(partial(values.best, allowed=allowed))(tables)[:, near]
-        later = product("ijn,ving->vigj", to_region, future)
-        goals = product("ijn,inj->ij", to_goal, jnp.take_along_axis(future[0], near[:, None], axis=2))
-        later = later.at[0].set(jnp.where(at_goal, goals[:, None], later[0]))
-        return rewards + section.discount * later, None
+    def sweep(q: Array, _: None) -> tuple[Array, None]:
+        future = values.best(q, allowed)[near]
+        later = product("ijn,ing->igj", to_region, future)
+        goals = product("ijn,inj->ij", to_goal, jnp.take_along_axis(future, near[:, None], axis=2))
+        return reward + section.discount * jnp.where(at_goal, goals[:, None], later), None
 
-    return jax.lax.scan(sweep, tables, None, length=sweeps)[0]
+    return jax.lax.scan(sweep, q, None, length=sweeps)[0]
 
 
 def _inherited(section: CommanderConfig, earlier: Model, traffic: Float[Array, "R R"], places: Places) -> Model:

@@ -106,7 +106,7 @@ def greedy(
     agent = levels.of(config, spec, greedy=True)
     segments = spec.episode_length // config.tutor.period
     reset_key, keys = hierarchy.segment_keys(key, segments)
-    streams = start(agent, env, goals=goals, greedy=True, key=reset_key)
+    streams = start(agent, env, goals=goals, key=reset_key)
     state, roadmap = hierarchy.prepare(agent, state)
 
     def one(streams: Streams, keys: Array) -> tuple[Streams, Any]:
@@ -125,16 +125,14 @@ def start(
     env: VectorEnv,
     *,
     goals: Float[Array, "B k"] | None = None,
-    greedy: bool = False,
     key: Array,
 ) -> Streams:
-    """Fresh environments with their clocks at 0, with `goals` if given; for training, or for `greedy` episodes."""
-    reset_key, practice_key = jax.random.split(key)
+    """Fresh environments with their clocks at 0, with `goals` if given."""
+    reset_key, _ = jax.random.split(key)  # so that runs stay as they were
     env_state = env.reset(reset_key)
     if goals is not None:
         env_state = env.with_goals(env_state, goals, jnp.ones(env.num_envs, bool))
-    position = agent.task.spec.abstract(env_state.obs)
-    memory = agent.commander.begin(agent.config.commander, position, greedy=greedy, key=practice_key)
+    memory = agent.commander.begin(agent.task.spec.abstract(env_state.obs))
     return Streams(env=env_state, memory=memory, lesson=(), episode=Episode.start(env_state.metrics["distance"]))
 
 

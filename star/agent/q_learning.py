@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 from star.abstraction.regions import Change
 from star.agent.decisions import Decision, Roadmap
 from star.agent.sections import CommanderConfig
-from star.agent.values import CommanderState, entries, td_error, towards_goals
+from star.agent.values import CommanderState, entries, td_error
 
 
 def init(*, regions: int, near: int) -> None:
@@ -33,7 +33,7 @@ def observe(
     """A step on what the streams decided at one instant; what a teacher chose rises to `margin` above all else."""
     error = td_error(section, state, roadmap.allowed, batch)
     cell = entries(roadmap.allowed.near, batch)
-    state = _step(section, state, cell, error, weight=jnp.maximum(batch.weight, batch.lost) * towards_goals(batch))
+    state = _step(section, state, cell, error, weight=jnp.maximum(batch.weight, batch.lost) * (1 - batch.aside))
     if batch.shown is None:
         return state
     lacking = _lacking(state.q[cell[:2]], cell[2], margin)

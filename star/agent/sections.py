@@ -44,9 +44,6 @@ class CommanderConfig(Section):
     hold: Literal[False, True, "region"] = setting(
         True, "The goal is commanded wherever it counts as reached (true), or all over its region (region)."
     )
-    practice: float = setting(
-        0.25, "This share of environments practises reaching random regions, one after another.", unit="", ge=0, le=1
-    )
     successors: Literal["all", "any", "possible", "known"] = setting(
         "any",
         "Greedy targets are any, those not shown unreachable (possible), or those shown reachable (known); "

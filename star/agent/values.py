@@ -24,8 +24,6 @@ class Model(struct.PyTreeNode):
     """Decisions by region, goal region and target, with those that ended an episode."""
     lost: Float[Array, "2 R S"]
     """Decisions by aim, region and target during which the episode was terminated."""
-    reach: Float[Array, "R R S"]
-    """Values like Q for those who practise: discounted chances of being in the pursued region."""
 
 
 class CommanderState(struct.PyTreeNode):
@@ -42,28 +40,24 @@ def choose(
     region: Int[Array, "B"],
     goal_region: Int[Array, "B"],
     *,
-    practised: Int[Array, "B"],
     attraction: Float[Array, "R"] | None = None,
     epsilon: Float[Array, "B"] | float,
     key: Array,
 ) -> Int[Array, "B"]:
     """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random.
 
-    Random ones are drawn evenly, or in proportion to `attraction`. `practised` are regions to pursue instead of the
-    goal where they are not negative.
+    Random ones are drawn evenly, or in proportion to `attraction`.
     """
     explore_key, random_key, tie_key = jax.random.split(key, 3)
     near = allowed.near.region[region]
-    reach = state.q if state.model is None else state.model.reach
-    values = jnp.where((practised >= 0)[:, None], reach[region, practised], state.q[region, goal_region])
-    pursued = jnp.where(practised >= 0, practised, goal_region)
-    best_values = jnp.where(targets(allowed.near, allowed.greedy, region, pursued), values, -jnp.inf)
+    values = state.q[region, goal_region]
+    best_values = jnp.where(targets(allowed.near, allowed.greedy, region, goal_region), values, -jnp.inf)
     ties = best_values >= best_values.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best_values.shape), -1.0), axis=-1)
     luck = jax.random.gumbel(random_key, best_values.shape)
     if attraction is not None:
         luck += jnp.log(jnp.maximum(attraction, 1e-6))[near]
-    anything = jnp.where(targets(allowed.near, allowed.explore, region, pursued), luck, -jnp.inf)
+    anything = jnp.where(targets(allowed.near, allowed.explore, region, goal_region), luck, -jnp.inf)
     exploring = jax.random.uniform(explore_key, region.shape) < epsilon
     place = jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
     return jnp.take_along_axis(near, place[:, None], axis=1)[:, 0]
@@ -104,11 +98,6 @@ def td_error(
 def entries(near: Near, batch: Decision) -> tuple[Int[Array, "N"], Int[Array, "N"], Int[Array, "N"]]:
     """Indices into Q of what was decided; the last is beyond its axis where the target is not near."""
     return batch.region, batch.goal_region, near.place[batch.region, batch.target]
-
-
-def towards_goals(batch: Decision) -> Float[Array, "N"]:
-    """1 for the decisions that pursued the goal of the task by way of a region."""
-    return (1 - batch.practised) * (1 - batch.aside)
 
 
 def targets(

@@ -1,6 +1,6 @@
 """The life of a lesson: what SGIM has chosen for an epoch, what it says of each decision, and what came of it.
 
-    begin       goals, strategies and teachers for the environments that do not practise
+    begin       goals, strategies and teachers for all environments
     mark        at every decision of the Tutor: the waypoints that are passed, and what levels have to know
     restart     where an episode ended early, the lesson begins anew
     end         competences are taken down, and SGIM learns which progress was made
@@ -85,19 +85,16 @@ def begin(
     teachers: Sequence[Demonstrations],
     env_state: EnvState,
     *,
-    taught: Bool[Array, "B"],
     key: Array,
 ) -> tuple[Lesson, EnvState, Graph]:
-    """Choose goals, strategies and teachers of the environments that are `taught`.
+    """Choose goals, strategies and teachers of all environments.
 
     Returns the lesson, the environments with its goals, and the graph with what teachers tell of the ways they lead.
     """
     obs = env_state.obs
     position = spec.abstract(obs)
-    lesson = strategies.assign(
-        config, state, teachers, start=position, goal=spec.goal_point(obs), taught=taught, key=key
-    )
-    env_state = _pursue(spec, env, env_state, lesson, jnp.ones_like(taught))
+    lesson = strategies.assign(config, state, teachers, start=position, goal=spec.goal_point(obs), key=key)
+    env_state = _pursue(spec, env, env_state, lesson, jnp.ones(env.num_envs, bool))
     lesson = lesson.replace(away=jnp.maximum(env_state.metrics["distance"] - spec.success_radius, 0.0))
     if config.detours and config.routes:
         paths, weight = ways(config, lesson, position)
@@ -149,7 +146,7 @@ def end(
     config: SgimConfig, spec: Spec, state: SgimState, lesson: Lesson, *, distance: Float[Array, "B"]
 ) -> tuple[SgimState, Metrics]:
     """SGIM's learning from an epoch whose last episodes ended `distance` m from their goals."""
-    over = jnp.ones_like(lesson.taught)
+    over = jnp.ones(distance.shape, bool)
     return learn(config, state, devices.whole(grade(lesson, over, distance, radius=spec.success_radius)))
 
 
@@ -220,8 +217,8 @@ def onward(
 def babbles(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
     """Mask of environments that follow random subgoals."""
     if "babbling" not in config.strategies:
-        return jnp.zeros(lesson.taught.shape, bool)
-    return lesson.taught & (lesson.choice.strategy == config.strategies.index("babbling"))
+        return jnp.zeros(lesson.leg.shape, bool)
+    return lesson.choice.strategy == config.strategies.index("babbling")
 
 
 def guided(config: SgimConfig, lesson: Lesson) -> Bool[Array, "B"]:
@@ -249,12 +246,10 @@ def grade(lesson: Lesson, over: Bool[Array, "B"], distance: Float[Array, "B"], *
 
 def learn(config: SgimConfig, state: SgimState, lesson: Lesson) -> tuple[SgimState, Metrics]:
     """Take in an epoch whose episodes are all graded."""
-    weight = lesson.taught.astype(jnp.float32)
-    taught = jnp.maximum(weight.sum(), 1.0)
-    after = selection.update(config.selection, state, lesson.choice, lesson.competence, weight=weight)
-    metrics = {"competence": jnp.sum(jnp.where(lesson.taught, lesson.competence, 0.0)) / taught}
+    after = selection.update(config.selection, state, lesson.choice, lesson.competence)
+    metrics = {"competence": lesson.competence.mean()}
     for number, name in enumerate(config.names):
-        metrics[f"share_{name}"] = jnp.sum(weight * (lesson.choice.strategy == number)) / taught
+        metrics[f"share_{name}"] = jnp.mean(lesson.choice.strategy == number)
     for number, teacher in enumerate(config.teachers, len(config.strategies)):
         metrics[f"queries_{teacher.name}"] = after.episodes[:, number].sum()
     return after, metrics | {"refused": after.refused}
@@ -281,7 +276,7 @@ def urgency(config: SgimConfig, state: SgimState) -> Float[Array, "R"] | float:
 
 def mimicking(config: SgimConfig, lesson: Lesson, teacher: int) -> Float[Array, ""]:
     """Share of the environments that imitate the actions of the teacher with this number."""
-    return jnp.mean(lesson.taught & (lesson.choice.strategy == len(config.strategies) + teacher))
+    return jnp.mean(lesson.choice.strategy == len(config.strategies) + teacher)
 
 
 def shown(demos: Demonstrations, period: int, *, size: int, key: Array) -> Shown:
@@ -304,9 +299,9 @@ def shown(demos: Demonstrations, period: int, *, size: int, key: Array) -> Shown
 
 
 def _pursue(spec: Spec, env: VectorEnv, env_state: EnvState, lesson: Lesson, mask: Bool[Array, "B"]) -> EnvState:
-    """`env_state` with the goals of the lesson where it is `taught` and an episode has just begun (`mask`)."""
+    """`env_state` with the goals of the lesson where an episode has just begun (`mask`)."""
     goals = spec.with_goal_point(spec.goal(env_state.obs), lesson.choice.goal)
-    return env.with_goals(env_state, goals, mask & lesson.taught)
+    return env.with_goals(env_state, goals, mask)
 
 
 def _along(start: Float[Array, "N d"], waypoints: Float[Array, "N L d"], parts: int) -> Float[Array, "N P d"]:

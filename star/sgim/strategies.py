@@ -34,8 +34,6 @@ class Lesson(struct.PyTreeNode):
 
     choice: Choice
     """Region, strategy and goal; the goal [B, d] is an abstract point."""
-    taught: Bool[Array, "B"]
-    """True where SGIM has a say: not in environments that practise reaching random regions."""
     waypoints: Float[Array, "B L d"]
     first: Int[Array, "B"]
     """The waypoint that an episode begins with; L where the Commander decides alone."""
@@ -60,7 +58,6 @@ def assign(
     *,
     start: Float[Array, "B d"],
     goal: Float[Array, "B d"],
-    taught: Bool[Array, "B"],
     key: Array,
 ) -> Lesson:
     """Choose a goal, a strategy and a teacher for each environment; `goal` is the one that the task has drawn."""
@@ -75,14 +72,14 @@ def assign(
         draw = partial(selection.select, config.selection, state, present)
         choice = jax.vmap(lambda only, key: draw(only, key=key))(only, keys).replace(goal=goal)
     if config.ask == "evenly":
-        drawn = jax.random.categorical(turn_key, jnp.where(present, 0.0, -jnp.inf), shape=taught.shape)
+        drawn = jax.random.categorical(turn_key, jnp.where(present, 0.0, -jnp.inf), shape=goal.shape[:1])
         choice = choice.replace(strategy=drawn)
     elif config.unaided:
-        alone = jax.random.uniform(turn_key, taught.shape) < selection.competence(state)[choice.region]
+        alone = jax.random.uniform(turn_key, goal.shape[:1]) < selection.competence(state)[choice.region]
         asks = choice.strategy >= len(config.strategies)
         choice = choice.replace(strategy=jnp.where(asks & alone, 0, choice.strategy))
-    choice = _within_budget(config, state, choice, taught)
-    return _prepare(config, state, teachers, choice, start=start, taught=taught, key=via_key)
+    choice = _within_budget(config, state, choice)
+    return _prepare(config, state, teachers, choice, start=start, key=via_key)
 
 
 def available(config: SgimConfig, state: SgimState, *, key: Array) -> Bool[Array, "S"]:
@@ -111,7 +108,6 @@ def _prepare(
     choice: Choice,
     *,
     start: Float[Array, "B d"],
-    taught: Bool[Array, "B"],
     key: Array,
 ) -> Lesson:
     """Goals and ways by the chosen strategies."""
@@ -124,7 +120,7 @@ def _prepare(
             via = ROUTES[name](state, start=start, goal=goal, key=key)
             waypoints, guided = jnp.where(mine[:, None, None], via[:, None], waypoints), guided | mine
     for number, (teacher, demos) in enumerate(zip(config.teachers, teachers, strict=True), len(config.strategies)):
-        mine = taught & (choice.strategy == number)
+        mine = choice.strategy == number
         if teacher.kind == "decomposition":
             route = demos.waypoints[nearest(demos, start, choice.goal)]
             route = jnp.pad(route, ((0, 0), (0, length - route.shape[1]), (0, 0)), mode="edge")
@@ -132,10 +128,9 @@ def _prepare(
         else:
             shown = demos.outcomes[nearest(demos, start if teacher.kind == "action" else None, choice.goal)]
             goal = jnp.where(mine[:, None], shown, goal)
-    first = jnp.where(guided & taught, 0, length)
+    first = jnp.where(guided, 0, length)
     return Lesson(
         choice=choice.replace(goal=goal, region=regions.locate(state.abstraction, goal)),
-        taught=taught,
         waypoints=waypoints,
         first=first,
         leg=first,
@@ -144,13 +139,13 @@ def _prepare(
     )
 
 
-def _within_budget(config: SgimConfig, state: SgimState, choice: Choice, taught: Bool[Array, "B"]) -> Choice:
+def _within_budget(config: SgimConfig, state: SgimState, choice: Choice) -> Choice:
     """The choices, with the first strategy wherever a teacher was asked more often than allowed."""
-    asked = jax.nn.one_hot(choice.strategy, len(config.names)) * taught[:, None]
+    asked = jax.nn.one_hot(choice.strategy, len(config.names))
     number = state.episodes.sum(axis=0) + jnp.cumsum(asked, axis=0)
     mine = choice.strategy[:, None]
     over = jnp.take_along_axis(number, mine, axis=1)[:, 0] > _budgets(config)[choice.strategy]
-    return choice.replace(strategy=jnp.where(over & taught, 0, choice.strategy))
+    return choice.replace(strategy=jnp.where(over, 0, choice.strategy))
 
 
 def _budgets(config: SgimConfig) -> Float[Array, "S"]:

@@ -11,7 +11,7 @@ import pytest
 from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.regions import Change, Near, Places
-from star.agent import commander, goal_only, planning, values
+from star.agent import commander, planning, values
 from star.agent.decisions import Decision, Finished, Roadmap, Successors, successors
 from star.agent.segments import Segment
 from star.agent.task import Task
@@ -38,15 +38,14 @@ spread = jax.jit(commander.spread, static_argnames="num_envs")
 
 
 @jax.jit
-def chosen_by(state, allowed, region, goal_region, practised, epsilon, key):
-    return values.choose(state, allowed, region, goal_region, practised=practised, epsilon=epsilon, key=key)
+def chosen_by(state, allowed, region, goal_region, epsilon, key):
+    return values.choose(state, allowed, region, goal_region, epsilon=epsilon, key=key)
 
 
-def choose(state, allowed, region, goal_region, *, practised=-1, epsilon, n=4000):
-    """The targets of `n` who are in a region, or of each in an array; they practise no region that is negative."""
+def choose(state, allowed, region, goal_region, *, epsilon, n=4000):
+    """The targets of `n` who are in a region, or of each in an array."""
     whole = lambda number: np.broadcast_to(np.asarray(number, np.int32), n)  # noqa: E731
-    where = whole(region), whole(goal_region), whole(practised)
-    return np.asarray(chosen_by(state, allowed, *where, epsilon, jax.random.key(0)))
+    return np.asarray(chosen_by(state, allowed, whole(region), whole(goal_region), epsilon, jax.random.key(0)))
 
 
 def begun(chosen):
@@ -82,7 +81,6 @@ def random_batch(seed):
         next_region=rng.integers(0, R, N).astype(np.int32),
         weight=(rng.random(N) < 0.7).astype(np.float32),
         lost=(rng.random(N) < 0.2).astype(np.float32),
-        practised=(rng.random(N) < 0.2).astype(np.float32),
         aside=(rng.random(N) < 0.2).astype(np.float32),
         goal=np.zeros((N, 2), np.float32),
     )
@@ -103,7 +101,6 @@ def slow_update(q, allowed, batch, *, alpha, discount):
         for n in range(N):
             if (
                 max(batch.weight[n], batch.lost[n])
-                and not batch.practised[n]
                 and not batch.aside[n]
                 and (batch.region[n], batch.goal_region[n], batch.target[n]) == (i, g, j)
             ):
@@ -160,9 +157,7 @@ def test_the_measured_reward_is_that_of_whole_periods_with_the_goal_of_the_task(
     state, allowed = random_state(0)
     batch = random_batch(0)
     metrics = jax.jit(commander.measure)(settings(), state, known(allowed), batch)
-    np.testing.assert_allclose(
-        metrics["reward"], batch.reward[batch.weight > batch.practised + batch.aside].mean(), rtol=1e-5
-    )
+    np.testing.assert_allclose(metrics["reward"], batch.reward[batch.weight > batch.aside].mean(), rtol=1e-5)
 
 
 @pytest.mark.parametrize("learner", ["q", "model"])
@@ -175,30 +170,28 @@ def test_periods_with_weight_0_teach_nothing(observe, learner):
 
 
 def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
-    """Value iteration from 0 over a model counted decision by decision: for the goals, and to be in their region."""
-    q, reach = np.zeros((2, R, R, R))
+    """Value iteration from 0 over a model counted decision by decision."""
+    q = np.zeros((R, R, R))
     reward, visits = np.zeros((2, R, R, R))
     to_region, to_goal = np.zeros((2, R, R, R + 1))
     for n in range(N):
         i, g, j = batch.region[n], batch.goal_region[n], batch.target[n]
         if batch.aside[n]:
             continue
-        led = to_goal if j == g and not batch.practised[n] else to_region
+        led = to_goal if j == g else to_region
         led[i, j, batch.next_region[n]] += batch.weight[n]
         led[i, j, R] += batch.lost[n]  # a state that is worth nothing
-        if not (batch.practised[n] and j == g):
-            reward[i, g, j] += max(batch.weight[n], batch.lost[n]) * batch.reward[n]
-            visits[i, g, j] += max(batch.weight[n], batch.lost[n])
+        reward[i, g, j] += max(batch.weight[n], batch.lost[n]) * batch.reward[n]
+        visits[i, g, j] += max(batch.weight[n], batch.lost[n])
 
     def weight(number):
         return prior * math.exp(-number / prior)
 
     for _ in range(sweeps):
-        value, chance = np.zeros((2, R + 1, R))
+        value = np.zeros((R + 1, R))
         for i in range(R):
             for g in range(R):
                 value[i, g] = max(q[i, g, j] for j in range(R) if allowed[i, j])
-                chance[i, g] = max(reach[i, g, j] for j in range(R) if allowed[i, j])
         for i in range(R):
             for j in range(R):
                 chances, believing = to_region[i, j].copy(), weight(to_region[i, j].sum())
@@ -212,8 +205,7 @@ def slow_plan(batch, allowed, believed, *, discount, prior, sweeps, belief=1.0):
                     r = reward[i, g, j] + succeeding * belief * (i == g == j)
                     later = (at_goal if j == g else chances) @ value[:, g]
                     q[i, g, j] = r / (visits[i, g, j] + succeeding) + discount * later
-                    reach[i, g, j] = (i == g) + discount * chances @ chance[:, g]
-    return q, reach
+    return q
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -226,14 +218,12 @@ def test_planning_is_value_iteration_on_the_counted_model(observe, seed):
     state = observe(chosen, begun(chosen), allowed, batch)
     roadmap = known(allowed, believed)
     planned = plan(chosen, state, roadmap)
-    q, reach = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
+    q = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=3)
     np.testing.assert_allclose(planned.q, q, rtol=1e-5)
-    np.testing.assert_allclose(planned.model.reach, reach, rtol=1e-5)
-    q, _ = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=4, belief=0.1)
+    q = slow_plan(batch, np.asarray(allowed.greedy), believed, discount=0.9, prior=2.0, sweeps=4, belief=0.1)
     for before in (state, planned):  # whatever was planned before
         settled = settle(chosen, before, roadmap, periods=4)
         np.testing.assert_allclose(settled.q, q, rtol=1e-5, atol=1e-12)
-        np.testing.assert_array_equal(settled.model.reach, before.model.reach)
 
 
 def corridor(batch_of, *, shortcut=False, greedy=False, periods=10):
@@ -260,7 +250,6 @@ def many(region, target, next_region, *, goal=4, count=100, lost=0.0, reward=0.0
         next_region=next_region * ones,
         weight=np.float32(1 - lost) * ones,
         lost=np.float32(lost) * ones,
-        practised=np.zeros(count, np.float32),
         aside=np.zeros(count, np.float32),
         goal=np.zeros((count, 2), np.float32),
     )
@@ -417,8 +406,6 @@ def test_a_goals_region_may_always_follow_itself():
     for there, greedy, random in ((0, {0}, {0, 1}), (2, {1}, {1})):
         assert set(choose(state, allowed, 0, there, epsilon=0.0).tolist()) == greedy
         assert set(choose(state, allowed, 0, there, epsilon=1.0).tolist()) == random
-    for there, practised, greedy in ((0, 3, {1}), (3, 0, {0})):  # what is practised is the goal
-        assert set(choose(state, allowed, 0, there, practised=practised, epsilon=0.0).tolist()) == greedy
     worth, targets = towards(state, allowed, 0)
     assert worth.tolist() == [1.0, *[0.0] * (R - 1)] and targets.tolist() == [0, *[1] * (R - 1)]
 
@@ -438,14 +425,6 @@ def test_epsilon_is_the_share_of_random_choices():
     state = CommanderState(q=q, chosen=np.zeros(R, np.float32))
     shares = np.bincount(choose(state, EVERYTHING, 0, 0, epsilon=0.5), minlength=R) / 4000
     np.testing.assert_allclose(shares, [0.6, 0.1, 0.1, 0.1, 0.1], atol=0.03)
-
-
-def test_who_practises_pursues_its_region_by_the_chances_to_reach_it():
-    state = begun(settings(learner="model"))
-    q, reach = state.q.copy(), state.model.reach.copy()
-    q[0, 1, 2] = reach[0, 3, 4] = 1.0
-    state = state.replace(q=q, model=state.model.replace(reach=reach))
-    assert choose(state, EVERYTHING, 0, 1, practised=[-1, 3], epsilon=0.0, n=2).tolist() == [2, 4]
 
 
 @pytest.mark.parametrize("reward", ["max", "mean"])
@@ -483,7 +462,7 @@ def test_a_period_that_success_ends_counts_as_if_the_agent_stayed_for_the_rest_o
         choice=None,
     )  # fmt: skip
     roadmap = Roadmap(abstraction=table, allowed=EVERYTHING, believed=None)
-    memory = commander.blank(obs[0, :, :2])
+    memory = commander.begin(obs[0, :, :2])
     memory = memory.replace(clock=memory.clock + clock, reward=jnp.full(3, so_far))
     run = jax.jit(lambda memory, passed: commander.experience(chosen, task, roadmap, memory, passed, Marks()))
     after, (decision, outcome) = jax.device_get(run(memory, passed))
@@ -508,15 +487,14 @@ def slow_recount(batch, cells, earlier, traffic, *, prior):
     for d in range(N):
         if batch.aside[d]:
             continue
-        at_goal = batch.target[d] == batch.goal_region[d] and not batch.practised[d]
+        at_goal = batch.target[d] == batch.goal_region[d]
         i, g, n = cells.region[d], cells.goal_region[d], cells.next_region[d]
         for j in [g] if at_goal else [j for j in every if ORIGIN[j] == batch.target[d]]:
             new["led"][int(at_goal), i, j, n] += batch.weight[d]
             new["lost"][int(at_goal), i, j] += batch.lost[d]
-            if at_goal or batch.target[d] != batch.goal_region[d]:
-                told = max(batch.weight[d], batch.lost[d])
-                new["visits"][i, g, j] += told
-                new["rewards"][i, g, j] += told * batch.reward[d]
+            told = max(batch.weight[d], batch.lost[d])
+            new["visits"][i, g, j] += told
+            new["rewards"][i, g, j] += told * batch.reward[d]
     model = {name: table.copy() for name, table in new.items()}
     of_whole = lambda i: [m for m in every if ORIGIN[m] == ORIGIN[i]]  # noqa: E731
     for i in every:
@@ -558,10 +536,10 @@ def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
         goal_region=goal_region,
         target=np.where(batch.at_goal, goal_region, batch.target),
     )
-    q, visits, rewards, reach, *led = 3 * np.random.default_rng(seed).random((6, R, R, R), np.float32)
+    q, visits, rewards, *led = 3 * np.random.default_rng(seed).random((5, R, R, R), np.float32)
     led, lost = np.stack(led), np.stack([visits[0], rewards[0]])
     led[:, :, :, 3:] = led[:, 3:] = led[:, :, 3:] = 0  # nothing there
-    earlier = Model(led=led, rewards=rewards, visits=visits, lost=lost, reach=reach)
+    earlier = Model(led=led, rewards=rewards, visits=visits, lost=lost)
     traffic = np.random.default_rng(seed).integers(0, 3, (R, R)).astype(np.float32)
     model = recounted(chosen, earlier, batch, cells, np.array(ORIGIN), traffic)
     for name, table in slow_recount(batch, cells, earlier, traffic, prior=2.0).items():
@@ -572,14 +550,13 @@ def test_after_cuts_an_epochs_decisions_are_counted_by_todays_regions(seed):
     decisions = batch.replace(goal=centre(cells.goal_region))
     where = centre(cells.region), centre(cells.next_region)
     finished = Finished(decisions, Outcome(where[0], where[0], where[0], where[1], batch.weight))
-    state = CommanderState(q=q, chosen=np.arange(1, R + 1, dtype=np.float32), model=earlier.replace(reach=reach + 1))
+    began = CommanderState(q=q, chosen=np.arange(1, R + 1, dtype=np.float32), model=earlier)
+    state = began.replace(model=jax.tree.map(lambda x: x + 1, earlier))  # which the epoch's counts have changed
     change = Change(before=boxes, after=boxes, splits=None, origin=np.array(ORIGIN))
-    began = state.replace(model=earlier)
     after = jax.device_get(follow(chosen, state, change, began, finished, traffic))
-    jax.tree.map(np.testing.assert_array_equal, after.model.replace(reach=0), model.replace(reach=0))
+    jax.tree.map(np.testing.assert_array_equal, after.model, model)
     cube = np.ix_(ORIGIN, ORIGIN, ORIGIN)
     np.testing.assert_array_equal(after.q, q[cube])
-    np.testing.assert_array_equal(after.model.reach, (reach + 1)[cube])
     np.testing.assert_array_equal(after.chosen, [1, 1, 3, 1, 5])
 
 
@@ -603,15 +580,6 @@ def test_who_began_beyond_the_cut_tells_nothing_of_this_side():
     after = recounted(chosen, began.model, batch, cells, np.array(ORIGIN), traffic)
     led = np.asarray(after.led)[0, :, 2]
     assert led[1, 2] / led[1].sum() < 0.02 and led[3, 2] / led[3].sum() > 0.98
-
-
-def test_nobody_practises_without_a_commander_or_in_greedy_episodes():
-    def practising(level, **greedy):
-        begin = jax.jit(lambda key: level.begin(settings(practice=0.3), jnp.zeros((400, 2)), key=key, **greedy))
-        return float((np.asarray(begin(jax.random.key(0)).practice) >= 0).mean())
-
-    assert practising(commander, greedy=False) == pytest.approx(0.3, abs=0.07)
-    assert practising(commander, greedy=True) == practising(goal_only, greedy=False) == 0
 
 
 def test_the_value_towards_a_goal_is_that_of_the_best_allowed_target():

@@ -86,7 +86,6 @@ def test_a_finished_period_tells_where_it_began_what_it_aimed_at_and_where_it_en
         assert decision.region[i, b] == recording.commanded.region[first, b]
         assert decision.goal_region[i, b] == recording.commanded.goal_region[first, b]
         assert decision.target[i, b] == recording.commanded.target[first, b]
-        assert decision.practised[i, b] == (recording.commanded.practice[first, b] >= 0)
         steps = -np.concatenate([recording.steps.distance[first, :, b], recording.steps.distance[i, :, b]])
         expected = steps.max() if recording.published else steps.mean()
         np.testing.assert_allclose(decision.reward[i, b], expected, rtol=1e-5)
@@ -266,7 +265,7 @@ def test_periods_beyond_the_room_of_the_buffer_count_for_refinement_too(tiny):
     outcome = Outcome(start=point, lower=point - 1, upper=point + 1, end=point, weight=whole)
     decision = Decision(
         region=none, goal_region=none, target=none + 1, reward=none, next_region=none, weight=whole, lost=none,
-        practised=none, aside=none, goal=point,
+        aside=none, goal=point,
     )  # fmt: skip
 
     @jax.jit
@@ -377,7 +376,7 @@ def test_after_a_split_the_commander_counts_by_the_new_regions(jitted):
     )
     ones, region = np.ones(2, np.float32), np.zeros(2, np.int32)
     aims = np.array([target, 0], np.int32)
-    decision = Decision(region, aims, aims, ones, region, ones, *[0 * ones] * 3, goal=goal)
+    decision = Decision(region, aims, aims, ones, region, ones, *[0 * ones] * 2, goal=goal)
     outcome = Outcome(start=start, lower=start, upper=start, end=end, weight=ones)
     known, follow = state.commander, jax.jit(commander.follow)
     of_epoch = Finished(decision, outcome), np.zeros_like(known.q[0])

@@ -56,7 +56,6 @@ CELLS = {
     "lost": {"rows": 1, "axes": (2,)},
     "rewards": {"rows": 0, "axes": (1, 2)},
     "visits": {"rows": 0, "axes": (1, 2)},
-    "reach": {"rows": 0, "axes": (2,)},
 }
 
 
@@ -73,7 +72,6 @@ def decisions(rng, near):
         next_region=beside(),
         weight=(rng.random(N) < 0.7).astype(np.float32),
         lost=(rng.random(N) < 0.2).astype(np.float32),
-        practised=(rng.random(N) < 0.2).astype(np.float32),
         aside=(rng.random(N) < 0.2).astype(np.float32),
         goal=np.zeros((N, 2), np.float32),
     )
@@ -105,7 +103,7 @@ def test_plans_are_those_of_a_commander_that_may_choose_the_same_targets(seed):
     one, other = plan(few, states[0], some), plan(all_, states[1], every)
     assert np.ptp(one.q) > 0.5
     settled = settle(few, states[0], some, periods=4), settle(all_, states[1], every, periods=4)
-    for found, expected in ((one.q, other.q), (one.model.reach, other.model.reach), [state.q for state in settled]):
+    for found, expected in ((one.q, other.q), [state.q for state in settled]):
         table = gathered(np.asarray(expected), near, axes=(2,), rows=0)
         np.testing.assert_allclose(found, table, rtol=1e-5, atol=1e-7)
 
@@ -125,7 +123,7 @@ def test_a_command_that_leads_further_is_not_counted():
 def test_after_cuts_tables_say_the_same_of_what_was_near_and_is(seed):
     rng = np.random.default_rng(seed)
     then, now, origin = lists(rng), lists(rng), np.array([0, 1, 2, 1, 4, 4, 6])
-    sizes = {"led": (2, R, S, S), "lost": (2, R, S), "rewards": (R, S, S), "visits": (R, S, S), "reach": (R, R, S)}
+    sizes = {"led": (2, R, S, S), "lost": (2, R, S), "rewards": (R, S, S), "visits": (R, S, S)}
     earlier = Model(**{name: 3 * rng.random(size, np.float32) for name, size in sizes.items()})
     wide = Model(**{name: spread(getattr(earlier, name), then, **where) for name, where in CELLS.items()})
     cells, traffic = decisions(rng, now), rng.integers(0, 3, (R, R)).astype(np.float32)
@@ -136,8 +134,9 @@ def test_after_cuts_tables_say_the_same_of_what_was_near_and_is(seed):
     for name in ("led", "lost", "rewards", "visits"):
         table = gathered(np.asarray(getattr(expected, name)), now, **CELLS[name])
         np.testing.assert_allclose(getattr(found, name), table, rtol=1e-5, atol=1e-6, err_msg=name)
-    inherited = values.inherited(earlier.reach, places)
-    table = values.inherited(wide.reach, every)
+    q = rng.random((R, R, S), np.float32)
+    inherited = values.inherited(q, places)
+    table = values.inherited(spread(q, then, axes=(2,), rows=0), every)
     np.testing.assert_array_equal(inherited, gathered(np.asarray(table), now, axes=(2,), rows=0))
 
 
@@ -160,9 +159,7 @@ def test_q_learning_and_choices_are_those_among_the_same_targets():
         ):
             np.testing.assert_array_equal(one, other)
     where, goal = rng.integers(0, R, (2, 300))
-    chosen = values.choose(
-        narrow, some.allowed, where, goal, practised=np.full(300, -1), epsilon=0.5, key=jax.random.key(0)
-    )
+    chosen = values.choose(narrow, some.allowed, where, goal, epsilon=0.5, key=jax.random.key(0))
     assert (near.place[where, chosen] < S).all()
     rows, _ = np.unique(np.stack([where, chosen]), axis=1)
     assert len(np.unique(rows)) == R
@@ -221,7 +218,7 @@ def test_the_commander_follows_cuts_by_what_was_near_before_and_is_after_them():
     states = []
     for section, table in ((settings(nearest=S), q), (settings(), spread(q, then, axes=(2,), rows=0))):
         state = commander.init(section, regions=R)
-        state = state.replace(q=jnp.asarray(table), model=state.model.replace(reach=jnp.asarray(table)))
+        state = state.replace(q=jnp.asarray(table))
         traffic = np.zeros((R, R), np.float32)
         states.append(jax.jit(commander.follow)(section, state, change, state, finished, traffic))
     found, expected = states

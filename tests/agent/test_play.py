@@ -47,9 +47,7 @@ def test_the_recording_shows_everything_that_the_tests_below_are_about(recording
     assert (over * recording.steps.terminated).any() and (over * recording.steps.non_finite).any()
     assert len(np.unique(recording.decision.region)) > 2
     at_goal = recording.commanded.target == recording.commanded.goal_region
-    practising = recording.commanded.practice >= 0
-    for some in (practising, at_goal & ~practising, ~at_goal & ~practising):
-        assert some.any() and not some.all()
+    assert at_goal.any() and not at_goal.all()
 
 
 def test_the_clock_counts_env_steps_modulo_k_and_restarts_with_the_episode(recording):
@@ -92,22 +90,10 @@ def test_the_box_is_the_region_or_the_surroundings_of_the_goal_in_its_own_region
     for i, b in streams_and_segments(recording):
         target, goal = recording.commanded.target[i, b], recording.before.env.obs[i, b, 4:6]
         lower, upper = recording.abstraction.lower[target], recording.abstraction.upper[target]
-        if target == recording.commanded.goal_region[i, b] and recording.commanded.practice[i, b] < 0:
+        if target == recording.commanded.goal_region[i, b]:
             lower, upper = goal - margin, goal + margin
         np.testing.assert_allclose(recording.commanded.box.lower[i, b], lower, rtol=1e-6)
         np.testing.assert_allclose(recording.commanded.box.upper[i, b], upper, rtol=1e-6)
-
-
-def test_a_region_is_practised_until_it_is_reached_and_by_the_same_environments(recording):
-    redrawn = 0
-    for i, b in streams_and_segments(recording):
-        before, after = recording.before.memory.practice[i, b], recording.commanded.practice[i, b]
-        assert (before < 0) == (after < 0) and after < recording.abstraction.count
-        reached = before == recording.commanded.region[i, b] and recording.before.memory.clock[i, b] == 0
-        drawn_before = before < recording.abstraction.count
-        assert after == before or reached or not drawn_before
-        redrawn += reached and after != before
-    assert redrawn > 0
 
 
 def test_targets_are_active_regions(recording):
@@ -300,7 +286,7 @@ def scene_of(spec, env_state):
 
 
 @pytest.mark.parametrize("hold", [True, False, "region"])
-def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_env, tiny, fresh, hold):
+def test_who_has_arrived_is_commanded_to_the_goal(breaking_env, tiny, fresh, hold):
     agent = loading.parse(tiny, {"commander.hold": hold}).hyper()
     spec = Spec.of(breaking_env.env)
 
@@ -308,25 +294,24 @@ def test_who_has_arrived_is_commanded_to_the_goal_unless_it_practises(breaking_e
         playing = levels.of(agent, spec, greedy=True)
         away = jnp.zeros_like(state.commander.q).at[..., 2].set(1.0)  # everybody is sent to region 2
         known = state.commander.replace(q=away)
-        streams = play.start(playing, breaking_env, greedy=True, key=key)
+        streams = play.start(playing, breaking_env, key=key)
         success = (jnp.arange(B) < 4).astype(jnp.float32)
         seen = scene_of(spec, streams.env)
         goal = jnp.where((jnp.arange(B) < 2)[:, None], seen.position, seen.goal)
         seen = seen._replace(goal=goal, success=success)  # the first two are in the region of their goal
-        memory = streams.memory.replace(practice=jnp.where(jnp.arange(B) % 4 == 3, 2, -1))
         roadmap = Roadmap.of(agent.commander, state.abstraction, state.graph)
         return commander.command(
-            agent.commander, playing.task, known, roadmap, memory, seen, Marks(), env_steps=None, key=key
+            agent.commander, playing.task, known, roadmap, streams.memory, seen, Marks(), env_steps=None, key=key
         )
 
     got = jax.jit(commanded)(fresh(3), jax.random.key(3))
     at_goal = np.asarray(got.target == got.goal_region)
     sent = np.asarray(got.target) == 2
-    inside, free = np.asarray(got.region == got.goal_region), np.arange(B) % 4 != 3
-    assert (np.asarray(got.goal_region) != 2).all() and 0 < inside[free].sum() < free.sum()
+    inside = np.asarray(got.region == got.goal_region)
+    assert (np.asarray(got.goal_region) != 2).all() and 0 < inside.sum() < B
     held = inside if hold == "region" else (np.arange(B) < 4) & hold
-    np.testing.assert_array_equal(at_goal[free], held[free])
-    np.testing.assert_array_equal(sent[free], ~held[free])
+    np.testing.assert_array_equal(at_goal, held)
+    np.testing.assert_array_equal(sent, ~held)
 
 
 def test_an_episode_shorter_than_a_period_has_a_plan_too(tiny, fresh):

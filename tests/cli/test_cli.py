@@ -122,10 +122,10 @@ def test_a_run_is_named_after_its_config_file_and_the_time(calls):
 
 
 def test_layers_lie_over_the_file_and_name_the_run(calls, folder):
-    (folder / "calm.yaml").write_text("commander: {practice: 0}")
+    (folder / "calm.yaml").write_text("commander: {epsilon_end: 0}")
     assert main("train point.yaml --with calm.yaml --commander.period 60".split()) == 0
     config, run_dir = calls[0]["config"], calls[0]["run_dir"]
-    assert (config.commander.practice, config.commander.period) == (0, 60)
+    assert (config.commander.epsilon_end, config.commander.period) == (0, 60)
     assert run_dir.name.startswith("point-calm-")
 
 

@@ -20,8 +20,7 @@ def _choose(mode, q, reaches, misses, count, epsilon, key):
     allowed = successors(mode, Near.every(R), reaches=reaches, misses=misses, active=active)
     where, goal = jax.random.randint(key, (2, B), 0, count)
     state = CommanderState(q=q, chosen=jnp.zeros(R))
-    nobody = jnp.full(B, -1)
-    chosen = values.choose(state, allowed, where, goal, practised=nobody, epsilon=epsilon, key=key)
+    chosen = values.choose(state, allowed, where, goal, epsilon=epsilon, key=key)
     return allowed, where, goal, chosen
 
 

@@ -130,12 +130,12 @@ def test_runs_of_the_same_name_are_told_apart_by_their_paths(make):
     assert history.labels(paths) == [str(paths[0]), str(paths[1]), "c"]
 
 
-OTHER = {"settings": {"commander.practice": 0.0}}
+OTHER = {"settings": {"commander.epsilon_end": 0.0}}
 LONGER = {"settings": {"trainer.total_env_steps": 800}}
 BOTH = {"settings": OTHER["settings"] | LONGER["settings"]}
 AS_BEFORE = {"settings": {}}
 FIRST, THEN = "star train run/config.yaml --run-dir run-again", "star train --resume run-again"
-PRACTICE, TOTAL = "--commander.practice", "--trainer.total_env_steps"
+RANDOM, TOTAL = "--commander.epsilon_end", "--trainer.total_env_steps"
 
 
 @pytest.mark.parametrize(
@@ -149,21 +149,21 @@ PRACTICE, TOTAL = "--commander.practice", "--trainer.total_env_steps"
         (
             [(400, BOTH)],
             800,
-            [(400, PRACTICE, "0.0"), (400, TOTAL, "800")],
-            f"{FIRST} && {THEN} {PRACTICE} 0.0 {TOTAL} 800",
+            [(400, RANDOM, "0.0"), (400, TOTAL, "800")],
+            f"{FIRST} && {THEN} {RANDOM} 0.0 {TOTAL} 800",
         ),
         (
             [(200, OTHER), (300, AS_BEFORE)],
             400,
-            [(200, PRACTICE, "0.0"), (300, PRACTICE, "0.5")],
-            f"{FIRST} {TOTAL} 200 && {THEN} {PRACTICE} 0.0 {TOTAL} 300 && {THEN} {TOTAL} 400",
+            [(200, RANDOM, "0.0"), (300, RANDOM, "0.5")],
+            f"{FIRST} {TOTAL} 200 && {THEN} {RANDOM} 0.0 {TOTAL} 300 && {THEN} {TOTAL} 400",
         ),
         ([(200, OTHER), (200, AS_BEFORE)], 400, [], FIRST),  # killed before a checkpoint
-        ([(0, OTHER)], 400, [(0, PRACTICE, "0.0")], f"{FIRST} {PRACTICE} 0.0"),
+        ([(0, OTHER)], 400, [(0, RANDOM, "0.0")], f"{FIRST} {RANDOM} 0.0"),
     ],
 )
 def test_settings_changed_on_resume_are_told_and_trained_again(make, monkeypatch, resumed, total, changed, again):
-    monkeypatch.chdir(make(settings={"commander.practice": 0.5}, resumed=resumed).parent)
+    monkeypatch.chdir(make(settings={"commander.epsilon_end": 0.5}, resumed=resumed).parent)
     facts = page.facts(read(Path("run")))
     assert facts["total_env_steps"] == total
     assert [(row["env_steps"], f"--{row['key']}", row["value"]) for row in facts["changes"]] == changed
@@ -180,9 +180,9 @@ def test_a_run_that_is_older_than_a_setting_is_trained_again_as_it_was(make, mon
 
 def test_settings_changed_on_resume_are_among_those_that_differ(make):
     first, second = read(make("first", resumed=[(400, BOTH)])), read(make("second"))
-    before = history.words(second.config)["commander.practice"]
+    before = history.words(second.config)["commander.epsilon_end"]
     assert page.content([first, second])["settings"] == [
-        {"key": "commander.practice", "values": [f"{before}, 0.0 from 400 env steps", before]},
+        {"key": "commander.epsilon_end", "values": [f"{before}, 0.0 from 400 env steps", before]},
         {"key": "trainer.total_env_steps", "values": ["800", "400"]},
     ]
 
@@ -193,7 +193,7 @@ def test_seeds_that_went_on_with_other_settings_are_not_those_of_one_run(make):
     assert [(row["env_steps"], row["key"]) for row in history.changes(both)] == [(200, "trainer.total_env_steps")]
     assert "trainer.seed" not in page.facts(both)["command"]
     other = read(alone(make, "other", 2, resumed=[(200, BOTH)]))
-    with pytest.raises(UserError, match="differ in commander.practice; "):
+    with pytest.raises(UserError, match="differ in commander.epsilon_end; "):
         history.together("all", [both, other])
 
 
@@ -424,7 +424,7 @@ def test_the_table_of_provenance_says_what_was_changed_on_resume(browser, make, 
     folders = make("one", resumed=[(200, AS_BEFORE), (300, OTHER)]), make("two", resumed=[(200, AS_BEFORE)])
     page.write({folder: load(folder / "config.yaml") for folder in folders}, tmp_path / "report.html")
     browser.open(tmp_path / "report.html")
-    row = "changed on resumecommander.practice 0.0 from 300 env stepsnothing"
+    row = "changed on resumecommander.epsilon_end 0.0 from 300 env stepsnothing"
     assert row in text(browser, "#provenance") and browser.problems == []
 
 

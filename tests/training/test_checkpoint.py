@@ -307,7 +307,7 @@ def test_the_critics_of_format_4_speak_of_returns_as_they_are(tmp_path):
     new = {
         f"{level}/returns/{name}": x for level in ("tutor", "controller") for name, x in (("mean", 0), ("variance", 1))
     }
-    assert set(after) - set(before) == set(new) and set(before) <= set(after)
+    assert set(after) - set(before) == set(new) and set(before) - set(after) == {"commander/model/reach"}
     for name, x in new.items():
         np.testing.assert_array_equal(after[name], [x, x])
     checkpoints.close()
@@ -323,6 +323,18 @@ def test_td3_of_format_5_saw_observations_and_rewards_as_they_are(tmp_path):
     learner = program.config.tutor.td3
     unit = jax.vmap(lambda rewards: td3.unit(learner, rewards))(state.tutor.rewards)
     np.testing.assert_allclose(unit, [1, 1], rtol=1e-5)
+    checkpoints.close()
+
+
+def test_a_commander_of_format_6_had_values_for_practice_which_are_left_out(tmp_path):
+    run_dir = unpacked("format_6", tmp_path)
+    assert "practice: 0.25" in (run_dir / "config.yaml").read_text()
+    checkpoints = Checkpoints(run_dir)
+    program = programs.build(checkpoints.config(480))
+    state = checkpoints.restore(480, jax.eval_shape(program.init, program.seed_keys()))
+    before = checkpoints.arrays(480)
+    assert before["commander/model/reach"].any()
+    np.testing.assert_array_equal(state.commander.q, before["commander/q"])
     checkpoints.close()
 
 
