@@ -84,14 +84,17 @@ def test_a_row_is_marked_as_of_an_older_version_unless_all_its_digests_are_those
 
 
 def test_who_is_ahead_is_told_only_where_the_interval_leaves_out_zero():
-    def row(*success):
-        return page.Row("", report(success), True)
+    def row(*success, today=True):
+        return page.Row("", report(success), today)
 
     wide = {"ant_maze/star": row(0.9, 0.95, 0.9), "ant_maze/gara": row(0.2, 1.0, 0.9), "ant_maze/flat": row(0, 0.01, 0)}
     gara, flat = page.verdicts(wide)
     assert "| not told apart | +0.22 [" in gara and "| ahead | +0.91 [" in flat
     assert gara.endswith("] | 3x16.4/3x16.4 |")
     assert "| behind | " in page.verdicts({"ant_maze/star": wide["ant_maze/flat"], "ant_maze/gara": row(1, 1, 1)})[0]
+    for ours, theirs in ((True, True), (True, False), (False, True)):
+        rows = {"ant_maze/star": row(1, 1, today=ours), "ant_maze/gara": row(0, 0, today=theirs)}
+        assert page.verdicts(rows)[0].startswith("| GARA, " if ours and theirs else f"| GARA {page.MARK}, ")
     assert page.unmeasured(wide).startswith("STAR on Ant Maze Cam, Ant Fall, labyrinth; GARA on ")
 
 

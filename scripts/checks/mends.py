@@ -55,8 +55,8 @@ MENDS = (
         "Q-learning learns nothing from periods that the task ended",
         "tests/agent/test_commander.py::test_q_learning_averages_the_errors_of_each_cell",
         "star/agent/q_learning.py",
-        "weight=jnp.maximum(batch.weight, batch.lost) * towards_goals(batch)",
-        "weight=batch.weight * towards_goals(batch)",
+        "weight=jnp.maximum(batch.weight, batch.lost) * (1 - batch.aside)",
+        "weight=batch.weight * (1 - batch.aside)",
     ),
     Mend(
         "an end looks like a way out of negative rewards",

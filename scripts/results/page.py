@@ -162,7 +162,10 @@ def hardware(rows: Mapping[str, Row]) -> str:
 
 
 def verdicts(rows: Mapping[str, Row]) -> list[str]:
-    """A line for each task and rival: whether STAR is ahead, by Welch's interval of the difference."""
+    """A line for each task and rival: whether STAR is ahead, by Welch's interval of the difference.
+
+    It is marked if either row is of an older version.
+    """
     lines = []
     for task, folder in FOLDERS.items():
         ours = rows.get(f"{folder}/star")
@@ -170,7 +173,8 @@ def verdicts(rows: Mapping[str, Row]) -> list[str]:
             theirs = rows.get(f"{folder}/{name}")
             if ours and theirs:
                 budgets = "/".join(map(_budget, (ours, theirs)))
-                lines.append(f"| {agent}{theirs.mark}, {task} | {_difference(ours, theirs)} | {budgets} |")
+                mark = theirs.mark or ours.mark
+                lines.append(f"| {agent}{mark}, {task} | {_difference(ours, theirs)} | {budgets} |")
     return lines
 
 
@@ -259,7 +263,7 @@ def _age(older: int, count: int) -> str:
     if not older:
         return "All rows are of the agent of today."
     which = "All rows are" if older == count else f"{older} of {count} rows are"
-    return f"{which} **of an older version** of the agent ({MARK}): no learning digest of today."
+    return f"{which} **of an older version** ({MARK}, on pairs if one row is): no learning digest of today."
 
 
 def charted(rows: Mapping[str, Row]) -> dict[str, list[str]]:
