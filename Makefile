@@ -5,7 +5,7 @@ TEST_EXTRAS ?= test
 PYTEST_ARGS ?= -n 2 --dist loadfile --no-loadscope-reorder
 # The first boxes follow no wall; three seeds show how far luck goes.
 CONFIG ?= configs/point_maze.yaml
-QUICK ?= --with configs/ablations/wrong_boxes.yaml --seeds 3 --trainer.eval_every 1 --total-env-steps 832000
+QUICK ?= --with configs/ablations/wrong_boxes.yaml --seeds 3 --trainer.eval_every 1 --total-env-steps 448000
 
 VENV := .venv
 BIN := $(VENV)/bin
