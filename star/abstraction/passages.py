@@ -12,8 +12,9 @@ end,
 is next to nothing, and enough periods began on either side.
 
 Goals beyond it are not reached. Of the periods in which agents were sent to a goal in their own region, next to none
-whose goal was on the other side of the plane ended there, while most goals on the agents' own side were reached. Nobody
-has to have been beyond.
+whose goal was on the other side of the plane ended there. Most goals on the agents' own side were reached, though, or
+in all regions if hardly any goal lies on their side. Nobody has to have been beyond. Few agents get there in an epoch,
+so these periods are counted over epochs, and fade.
 
 Of several planes the one with most evidence is a cut, and of these the one that is farthest from where agents were and
 goals are: in the middle of the wall.
@@ -26,6 +27,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from star.abstraction import regions
@@ -38,8 +40,22 @@ LEAST = 5  # periods on either side: the far side of a wall is rarely visited
 TRIES = 10  # periods towards goals on the other side
 PASSED = 0.1  # the most of them that end there: regions are large, and a period may end before a plane that is far
 ABLE = 0.5  # the least of the goals on their own side that agents reach: who cannot walk yet reaches none
+KEPT = 0.9  # of what was counted, for the next epoch
 
 Planes = Float[Array, "R d planes"]
+
+
+class Tries(struct.PyTreeNode):
+    """Fading counts, for each plane through a region, of periods of agents there towards a goal in the region."""
+
+    beyond: Planes
+    """Those whose goal was on the other side of the plane."""
+    passed: Planes
+    """Those of them that ended there."""
+    beside: Planes
+    """Those whose goal was on the agent's own side."""
+    met: Planes
+    """Those of them that reached it."""
 
 
 class Ways(NamedTuple):
@@ -52,19 +68,25 @@ class Ways(NamedTuple):
     weight: Float[Array, "N"]
 
 
+def untried(*, capacity: int, dimensions: int) -> Tries:
+    """Nothing counted."""
+    return Tries(*[jnp.zeros((capacity, dimensions, PLANES - 1))] * 4)
+
+
 def cuts(
     abstraction: Abstraction,
     periods: Outcome,
     goals: Outcome,
     reached: Bool[Array, "M"],
+    earlier: Tries,
     *,
     min_width: float | Array,
-) -> tuple[Cut, Float[Array, "R"]]:
-    """The cut of each region [R], and the periods that speak for it; 0 where there is none.
+) -> tuple[Cut, Float[Array, "R"], Tries]:
+    """The cut of each region [R], the periods that speak for it, 0 where there is none, and what is counted by now.
 
     `periods` [N] are remembered ones; who has not moved by `min_width` along any dimension tells nothing. `goals` [M]
-    are those of an epoch in which agents were given a goal, and whether it was `reached`. Both sides of a cut are
-    `min_width` wide or more.
+    are those of an epoch in which agents were given a goal, and whether it was `reached`; those of `earlier` epochs
+    count as well. Both sides of a cut are `min_width` wide or more.
     """
     corner, sides = abstraction.lower, abstraction.upper - abstraction.lower
     inside = jnp.arange(1, PLANES) / PLANES * sides[..., None]
@@ -72,13 +94,15 @@ def cuts(
     walked = _ways(abstraction, [periods.start, periods.end], periods.weight)
     tried = _ways(abstraction, [goals.start, (goals.lower + goals.upper) / 2, goals.end], goals.weight)
     moved = jnp.abs(periods.end - periods.start).max(axis=-1) >= min_width
+    own = tried._replace(weight=tried.weight * (tried.region[0] == tried.region[1]))
+    tries = jax.tree.map(lambda old, new: KEPT * old + new, earlier, _tries(abstraction, own, reached))
+    able = jnp.sum(own.weight * reached) >= ABLE * jnp.maximum(own.weight.sum(), 1.0)
     evidence = jnp.maximum(
-        _leading_apart(abstraction, walked._replace(weight=walked.weight * moved)),
-        _not_passed(abstraction, tried, reached),
+        _leading_apart(abstraction, walked._replace(weight=walked.weight * moved)), _not_passed(tries, able)
     )
     room = _room(_free(abstraction, walked, tried))
     score = jnp.where(wide & (evidence > 0), evidence + room / PLANES, 0.0)
-    return _best(score, corner[..., None] + inside), jnp.floor(score.max(axis=(1, 2)))
+    return _best(score, corner[..., None] + inside), jnp.floor(score.max(axis=(1, 2))), tries
 
 
 def _leading_apart(abstraction: Abstraction, walked: Ways) -> Planes:
@@ -109,19 +133,29 @@ def _leading_apart(abstraction: Abstraction, walked: Ways) -> Planes:
     return jnp.where((fewer >= LEAST) & (overlap <= OVERLAP), fewer, 0.0)
 
 
-def _not_passed(abstraction: Abstraction, tried: Ways, reached: Bool[Array, "M"]) -> Planes:
-    """The periods towards goals beyond each plane that agents do not pass; 0 at all others."""
-    region, goal_region, there = tried.region
-    began, wanted, ended = tried.part
-    weight = tried.weight * (region == goal_region)
+def _tries(abstraction: Abstraction, own: Ways, reached: Bool[Array, "M"]) -> Tries:
+    """Count what agents did towards goals in their `own` region, and whether they `reached` them."""
+    (region, _, there), (began, wanted, ended) = own.region, own.part
     low, high = jnp.minimum(began, wanted), jnp.maximum(began, wanted)
     got = jnp.clip(jnp.where((there == region)[:, None], ended, began), low, high)  # so far on the way to the goal
     parts = jnp.stack([low, high, jnp.minimum(began, got), jnp.maximum(began, got), low, high])
-    below, total = _below(abstraction, region, parts, jnp.stack([weight] * 4 + [weight * reached] * 2))
-    attempts, passed = below[0] - below[1], below[2] - below[3]
-    on_own_side, met = below[1] + total[1] - below[0], below[5] + total[5] - below[4]
-    able = met >= ABLE * jnp.maximum(on_own_side, TRIES)
-    return jnp.where((attempts >= TRIES) & (passed <= PASSED * attempts) & able, attempts, 0.0)
+    below, total = _below(abstraction, region, parts, jnp.stack([own.weight] * 4 + [own.weight * reached] * 2))
+    return Tries(
+        beyond=below[0] - below[1],
+        passed=below[2] - below[3],
+        beside=below[1] + total[1] - below[0],
+        met=below[5] + total[5] - below[4],
+    )
+
+
+def _not_passed(tries: Tries, able: Bool[Array, ""]) -> Planes:
+    """The periods towards goals beyond each plane that agents do not pass; 0 at all others.
+
+    `able` says whether agents mostly reach goals in their own region, wherever that is.
+    """
+    can = jnp.where(tries.beside < TRIES, able, tries.met >= ABLE * tries.beside)
+    blocked = (tries.beyond >= TRIES) & (tries.passed <= PASSED * tries.beyond)
+    return jnp.where(blocked & can, jnp.floor(tries.beyond), 0.0)
 
 
 def _ways(abstraction: Abstraction, points: list[Float[Array, "N d"]], weight: Float[Array, "N"]) -> Ways:

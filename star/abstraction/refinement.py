@@ -33,6 +33,7 @@ from jaxtyping import Array, Bool, Float, Int
 from envs.common.batching import where
 from star.abstraction import cutting, forward_model, passages, reachability, regions
 from star.abstraction.forward_model import ForwardModelState, Outcome
+from star.abstraction.passages import Tries
 from star.abstraction.reachability import MISSES, MIXED, REACHES, UNKNOWN, Leaves
 from star.abstraction.regions import Abstraction, Change, Cut, Split
 from star.abstraction.sections import AbstractionConfig, ForwardModelConfig, RefinementConfig
@@ -69,6 +70,8 @@ class Graph(struct.PyTreeNode):
     stable: Bool[Array, "R R"]
     told: Int[Array, "R R"]
     """By teachers: 1 where they go from one into the other, -1 where they only go by way of a third, else 0."""
+    tries: Tries
+    """Of each region, how goals in it were tried from within."""
 
     @property
     def reaches(self) -> Bool[Array, "*seeds R R"]:
@@ -81,7 +84,7 @@ class Graph(struct.PyTreeNode):
         return self.verdict == MISSES
 
 
-def init(*, capacity: int) -> Graph:
+def init(*, capacity: int, dimensions: int) -> Graph:
     """Nothing known."""
     square = (capacity, capacity)
     return Graph(
@@ -91,6 +94,7 @@ def init(*, capacity: int) -> Graph:
         error=jnp.full(square, jnp.inf, jnp.float32),
         stable=jnp.zeros(square, bool),
         told=jnp.zeros(square, jnp.int32),
+        tries=passages.untried(capacity=capacity, dimensions=dimensions),
     )
 
 
@@ -239,7 +243,10 @@ def _separate(
     if not config.refinement.separate:
         none = jnp.zeros(0, jnp.int32)
         return abstraction, graph, Split(done=none > 0, cut=Cut(none, none, jnp.zeros(0)), child=none)
-    cuts, evidence = passages.cuts(abstraction, periods, goals, met, min_width=config.abstraction.min_width)
+    cuts, evidence, tries = passages.cuts(
+        abstraction, periods, goals, met, graph.tries, min_width=config.abstraction.min_width
+    )
+    graph = graph.replace(tries=tries)
     worst = jnp.argsort(-evidence)[:_SEPARATED]
 
     def one(carry: tuple[Abstraction, Graph], chosen: tuple[Cut, Array]) -> tuple[tuple[Abstraction, Graph], Split]:
@@ -279,10 +286,12 @@ def on_split(graph: Graph, split: Split) -> Graph:
     """
     index = jnp.arange(graph.verdict.shape[0])
     new = split.done & (index == split.child)
-    parts = jax.tree.map(partial(regions.inherit, origin=jnp.where(new, split.parent, index)), graph)
+    origin = jnp.where(new, split.parent, index)
+    parts = jax.tree.map(partial(regions.inherit, origin=origin), graph.replace(tries=None))
     changed = new | (split.done & (index == split.parent))
     pair = changed[:, None] | changed
     return parts.replace(
+        tries=jax.tree.map(lambda x: jnp.where(changed[:, None, None], 0.0, x), graph.tries),
         verdict=jnp.where(changed, UNKNOWN, parts.verdict),
         transitions=jnp.where(pair, 0.0, parts.transitions),
         told=jnp.where(pair, jnp.minimum(parts.told, 0), parts.told),

@@ -60,7 +60,7 @@ def init(config: AgentConfig, spec: Spec, *, key: Array) -> TrainState:
         adjacency=adjacency.init(adjacency_key, config.tutor.adjacency, spec.space),
         controller=controller.init(controller_key, config.controller, agent.task),
         abstraction=abstraction,
-        graph=refinement.init(capacity=abstraction.capacity),
+        graph=refinement.init(capacity=abstraction.capacity, dimensions=abstraction.lower.shape[-1]),
         forward_model=forward_model.init(model_key, config.forward_model, space=abstraction.space),
         sgim=agent.guide.init(config.sgim, abstraction),
         epoch=jnp.zeros((), jnp.int32),

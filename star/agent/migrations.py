@@ -5,14 +5,16 @@ Whoever changes what is saved adds one to `FORMAT`, a row to `TO_NEXT` and, unde
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
 
+from star.abstraction.passages import PLANES, Tries
 from star.config.kinds import Arrays, Migration
 from star.learners.sections import TD3Config
 
-FORMAT = 7  # since nobody practises to reach random regions
+FORMAT = 8  # since tries of goals within a region are counted over epochs
 
 
 def _count_for_both_aims(arrays: Arrays) -> Arrays:
@@ -62,10 +64,18 @@ def _no_values_of_practice(arrays: Arrays) -> Arrays:
     return {name: x for name, x in arrays.items() if name != "commander/model/reach"}
 
 
+def _nothing_tried(arrays: Arrays) -> Arrays:
+    """Each epoch forgot how agents had tried to reach goals in their own region."""
+    lower = arrays["abstraction/lower"]
+    none = np.zeros((*lower.shape, PLANES - 1), np.float32)
+    return arrays | {f"graph/tries/{count.name}": none for count in dataclasses.fields(Tries)}
+
+
 TO_NEXT: Mapping[int, Migration] = {
     2: Migration(),  # the same, in other files and without checksums
     3: Migration(arrays=_count_for_both_aims),
     4: Migration(arrays=_returns_as_they_are),
     5: Migration(arrays=_observations_as_they_are),
     6: Migration(arrays=_no_values_of_practice),
+    7: Migration(arrays=_nothing_tried),
 }

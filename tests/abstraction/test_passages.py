@@ -6,7 +6,7 @@ import pytest
 
 from star.abstraction import passages, regions
 from star.abstraction.forward_model import Outcome
-from star.abstraction.passages import ABLE, LEAST, OVERLAP, PASSED, PLANES, TRIES
+from star.abstraction.passages import ABLE, KEPT, LEAST, OVERLAP, PASSED, PLANES, TRIES
 
 SPACE = ((0.0, 0.0), (16.0, 8.0))
 CUTS = jax.jit(passages.cuts)
@@ -31,6 +31,7 @@ def halves(*, max_regions=4):
 
 
 NOWHERE = periods([], [])
+UNTRIED = passages.untried(capacity=4, dimensions=2)
 
 
 def towards(start, goal, end):
@@ -42,9 +43,14 @@ def towards(start, goal, end):
 
 def found(periods, goals=None, *, min_width=1.0):
     """(cut, evidence) of the region [0, 8)."""
-    cuts, evidence = CUTS(halves(), periods, *(goals or towards([], [], [])), min_width=min_width)
-    cuts, evidence = jax.device_get((cuts, evidence))
-    return jax.tree.map(lambda x: x[0], cuts), float(evidence[0])
+    return later(UNTRIED, periods, goals, min_width=min_width)[:2]
+
+
+def later(tries, periods, goals=None, *, min_width=1.0):
+    """(cut, evidence) of the region [0, 8) after an epoch more, and the tries by then."""
+    told = CUTS(halves(), periods, *(goals or towards([], [], [])), tries, min_width=min_width)
+    cuts, evidence, tries = jax.device_get(told)
+    return jax.tree.map(lambda x: x[0], cuts), float(evidence[0]), tries
 
 
 def walking(rng, n, low, high):
@@ -125,7 +131,8 @@ def test_cuts_are_those_of_a_slow_count(seed):
     more = walking(rng, 30, (0, 0), (16, 8))
     start, end = (np.concatenate([a, b]).astype(np.float32) for a, b in ((start, more[0]), (end, more[1])))
     moved = np.abs(end - start).max(axis=1) >= 1.0
-    cuts, evidence = jax.device_get(CUTS(abstraction, periods(start, end), *towards([], [], []), min_width=1.0))
+    told = CUTS(abstraction, periods(start, end), *towards([], [], []), UNTRIED, min_width=1.0)
+    cuts, evidence, _ = jax.device_get(told)
     start, end = start[moved], end[moved]
     ways = (*(np.clip(points[:, 0], 0, 15) // 8 for points in (start, end)), start, end)
     lower, upper = np.asarray(abstraction.lower), np.asarray(abstraction.upper)
@@ -147,7 +154,8 @@ def test_cuts_are_those_of_a_slow_count(seed):
 
 
 def test_regions_not_in_use_are_not_cut():
-    cuts, evidence = CUTS(halves(), periods(*two_rooms(np.random.default_rng(5))), *towards([], [], []), min_width=1.0)
+    walked = periods(*two_rooms(np.random.default_rng(5)))
+    cuts, evidence, _ = CUTS(halves(), walked, *towards([], [], []), UNTRIED, min_width=1.0)
     np.testing.assert_array_equal(evidence[2:], 0.0)
     assert np.isfinite(cuts.position).all()
 
@@ -209,8 +217,40 @@ def test_planes_that_are_not_passed_are_those_of_a_slow_count(seed):
             across = within & (below(start) != below(goal))
             passed = across & (below(end) == below(goal)) & (end[:, 0] < 8)
             own = within & ~across
-            able = (own & sent[1][: len(own)]).sum() >= ABLE * max(own.sum(), TRIES)
+            able = own.sum() >= TRIES and (own & sent[1][: len(own)]).sum() >= ABLE * own.sum()
             if able and across.sum() >= TRIES and passed.sum() <= PASSED * across.sum():
                 counts[dimension, k / 4] = across.sum()
     assert counts and evidence == max(counts.values())
     assert counts[int(cut.dimension), float(cut.position)] == evidence
+
+
+def no_goals_on_their_side(rng, *, tries, elsewhere):
+    """Agents just above a wall from y = 3 to 5 have goals below it; of the other region's a share is reached."""
+    start = rng.uniform((0, 5), (8, 5.8), (tries, 2))
+    goal = rng.uniform((0, 0), (8, 3), (tries, 2))
+    there = rng.uniform((8, 0), (16, 8), (100, 2))
+    moved = there + np.where(np.arange(100) < 100 * elsewhere, 0, 4)[:, None] * np.where(there > 4, -1, 1)
+    both = lambda one, other: np.concatenate([one, other])  # noqa: E731
+    return towards(both(start, there), both(goal, there), both(start, moved))
+
+
+def test_where_no_goal_is_on_their_side_it_counts_what_agents_reach_elsewhere():
+    """An agent may stand in a sliver of the goal's region, on the wrong side of a wall, in which goals never lie."""
+    rng = np.random.default_rng(9)
+    cut, evidence = found(NOWHERE, no_goals_on_their_side(rng, tries=TRIES, elsewhere=0.9))
+    assert evidence == TRIES and int(cut.dimension) == 1 and 3 <= float(cut.position) <= 5
+    assert found(NOWHERE, no_goals_on_their_side(rng, tries=TRIES, elsewhere=0.3))[1] == 0
+
+
+def test_few_tries_an_epoch_add_up_and_fade():
+    rng, tries, seen = np.random.default_rng(10), UNTRIED, []
+    for _ in range(5):
+        _, evidence, tries = later(tries, NOWHERE, no_goals_on_their_side(rng, tries=4, elsewhere=0.9))
+        seen.append(evidence)
+    counted = [4 * sum(KEPT**k for k in range(n)) for n in range(1, 6)]
+    assert seen == [int(n) if n >= TRIES else 0 for n in counted]
+    assert seen[0] == 0 < seen[-1]
+    for _ in range(5):
+        _, evidence, tries = later(tries, NOWHERE, no_goals_on_their_side(rng, tries=0, elsewhere=0.9))
+    np.testing.assert_allclose(tries.beyond[0, 1].max(), counted[-1] * KEPT**5, rtol=1e-5)
+    assert evidence == 0

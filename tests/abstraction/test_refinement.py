@@ -10,6 +10,7 @@ import pytest
 
 from star.abstraction import cutting, forward_model, refinement, regions
 from star.abstraction.forward_model import Outcome
+from star.abstraction.passages import KEPT, PLANES, Tries
 from star.abstraction.reachability import MISSES, REACHES, UNKNOWN, Leaves
 from star.abstraction.refinement import Graph
 from star.abstraction.regions import Cut, Split
@@ -53,7 +54,7 @@ def grid(cuts=((8.0,), (8.0,))):
 
 def begun():
     """A graph that knows nothing."""
-    return jax.device_get(refinement.init(capacity=R))
+    return jax.device_get(refinement.init(capacity=R, dimensions=2))
 
 
 # Compiled once, not each time that a test calls them.
@@ -77,6 +78,7 @@ def random_graph(seed):
         error=rng.random((R, R)).astype(np.float32),
         stable=rng.random((R, R)) < 0.5,
         told=rng.integers(-1, 2, (R, R)).astype(np.int32),
+        tries=Tries(*rng.integers(0, 9, (4, R, 2, PLANES - 1)).astype(np.float32)),
     )
 
 
@@ -259,6 +261,8 @@ def test_after_a_split_starts_inherit_verdicts_and_targets_begin_anew():
             assert float(after.error[i, j]) == float(graph.error[old])
             assert bool(after.stable[i, j]) == bool(graph.stable[old])
             assert int(after.told[i, j]) == (min(int(graph.told[old]), 0) if changed else int(graph.told[old]))
+        for before, now in zip(jax.tree.leaves(graph.tries), jax.tree.leaves(after.tries), strict=True):
+            np.testing.assert_array_equal(now[i], 0 if i in (1, 4) else before[i])
     unchanged = on_split(graph, split_of(False))
     jax.tree.map(np.testing.assert_array_equal, graph, unchanged)
 
@@ -423,6 +427,9 @@ def test_a_region_is_cut_besides_where_nobody_passes_and_the_graph_follows(refin
     new = [np.asarray(corner)[4].tolist() for corner in (after.lower, after.upper)]
     assert new == [[pytest.approx(2.0, abs=12 / 32), -4.0], [8.0, 8.0]]
     assert (np.asarray(told.verdict)[:, [0, 4]] == UNKNOWN).all()
+    counts = np.asarray(told.tries.beyond)  # of the cut region anew; no goal was tried in this epoch
+    assert not counts[[0, 4]].any()
+    np.testing.assert_allclose(counts[1:4], KEPT * graph.tries.beyond[1:4])
     assert (np.asarray(told.transitions)[[0, 4]] == 0).all()
 
 

@@ -272,7 +272,7 @@ def test_periods_beyond_the_room_of_the_buffer_count_for_refinement_too(tiny):
     def learnt(key):
         state = SimpleNamespace(
             forward_model=forward_model.init(key, config.forward_model, space=space),
-            graph=refinement.init(capacity=2),
+            graph=refinement.init(capacity=2, dimensions=2),
             abstraction=regions.create(tuple(space), [[3.0], []], max_regions=2),
             replace=lambda **parts: SimpleNamespace(**parts),
         )

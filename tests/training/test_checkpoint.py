@@ -307,7 +307,8 @@ def test_the_critics_of_format_4_speak_of_returns_as_they_are(tmp_path):
     new = {
         f"{level}/returns/{name}": x for level in ("tutor", "controller") for name, x in (("mean", 0), ("variance", 1))
     }
-    assert set(after) - set(before) == set(new) and set(before) - set(after) == {"commander/model/reach"}
+    tries = {name for name in after if name.startswith("graph/tries/")}
+    assert set(after) - set(before) - tries == set(new) and set(before) - set(after) == {"commander/model/reach"}
     for name, x in new.items():
         np.testing.assert_array_equal(after[name], [x, x])
     checkpoints.close()
@@ -335,6 +336,18 @@ def test_a_commander_of_format_6_had_values_for_practice_which_are_left_out(tmp_
     before = checkpoints.arrays(480)
     assert before["commander/model/reach"].any()
     np.testing.assert_array_equal(state.commander.q, before["commander/q"])
+    checkpoints.close()
+
+
+def test_in_format_7_nothing_was_known_of_tries_in_earlier_epochs(tmp_path):
+    checkpoints = Checkpoints(unpacked("format_7", tmp_path))
+    program = programs.build(checkpoints.config(480))
+    state = checkpoints.restore(480, jax.eval_shape(program.init, program.seed_keys()))
+    new = {"graph/tries/beyond", "graph/tries/passed", "graph/tries/beside", "graph/tries/met"}
+    before = checkpoints.arrays(480)
+    assert set(STAR.migrated_arrays(before, 7)) - set(before) == new
+    assert all(not x.any() for x in jax.tree.leaves(state.graph.tries))
+    np.testing.assert_array_equal(state.graph.transitions, before["graph/transitions"])
     checkpoints.close()
 
 
