@@ -11,6 +11,7 @@ import pytest
 
 from scripts.pages import charts
 from scripts.results import digest, page, tutoring
+from star.config.loading import load
 
 ROOT = Path(__file__).parents[1]
 RENEW = "run `python scripts/results/page.py`"
@@ -96,6 +97,17 @@ def test_who_is_ahead_is_told_only_where_the_interval_leaves_out_zero():
         rows = {"ant_maze/star": row(1, 1, today=ours), "ant_maze/gara": row(0, 0, today=theirs)}
         assert page.verdicts(rows)[0].startswith("| GARA, " if ours and theirs else f"| GARA {page.MARK}, ")
     assert page.unmeasured(wide).startswith("STAR on Ant Maze Cam, Ant Fall, labyrinth; GARA on ")
+
+
+@pytest.mark.parametrize("agent", sorted(path.stem for path in (ROOT / "configs" / "agents").glob("*.yaml")))
+def test_every_agent_can_be_made_small_for_its_digest(agent):
+    """And has transitions enough to learn from in its three epochs, if it has a replay buffer."""
+    config = load(ROOT / "configs" / "ant_maze.yaml", {}, layers=[ROOT / "configs" / "agents" / f"{agent}.yaml"])
+    small = digest.made_small(config)
+    steps = small.env.options["episode_length"]
+    assert small.trainer.num_envs == 32 and steps % small.tutor.period == 0
+    learner = getattr(small.controller, small.controller.learner)
+    assert getattr(learner, "min_transitions", 0) <= digest.EPOCHS * steps * small.trainer.num_envs
 
 
 def test_a_digest_sees_a_weight_that_moved_and_neither_keys_nor_what_is_not_finite():

@@ -60,20 +60,30 @@ def compute(config: Any) -> dict[str, Any]:
     """The digest of a resolved config of STAR."""
     import jax
 
-    from star.config.loading import parse
     from star.training import program as programs
 
-    values = config.model_dump(mode="json")
-    small = {key: value for key, value in SMALL.items() if key.startswith("env.") or _find(values, key) is not None}
-    small["tutor.unroll"] = min(small["tutor.unroll"], config.tutor.unroll)
-    large = {key: _find(values, key) for key in SMALL} | config.model_dump(mode="json", exclude_defaults=True)
+    large = {key: _find(config.model_dump(mode="json"), key) for key in SMALL}
+    large |= config.model_dump(mode="json", exclude_defaults=True)
     large.pop("trainer", None)  # seeds, budget and evaluations: the row itself tells them
-    program = programs.build(parse(values, small | {"trainer.seed": SEED, "trainer.num_seeds": 1}))
+    program = programs.build(made_small(config))
     state = program.init(program.seed_keys())
     begun = jax.device_get(jax.tree.map(lambda leaf: leaf.copy(), state))  # an epoch uses it up
     for _ in range(EPOCHS):
         state, _ = program.epoch(state)
     return {"settings": _hash(large), "moved": moved(begun, jax.device_get(state))}
+
+
+def made_small(config: Any) -> Any:
+    """A resolved `config` with the numbers of `SMALL`, and of `FUTURES` if its Controller learns so."""
+    from star.config.loading import parse
+
+    values = config.model_dump(mode="json")
+    small = {key: value for key, value in SMALL.items() if key.startswith("env.") or _find(values, key) is not None}
+    small["tutor.unroll"] = min(small["tutor.unroll"], config.tutor.unroll)
+    if (learner := config.controller.learner) in WITH_FUTURES:
+        networks = WITH_FUTURES[learner]
+        small |= {f"controller.{learner}.{key}": x for key, x in (networks | FUTURES).items()} | {"tutor.period": 10}
+    return parse(values, small | {"trainer.seed": SEED, "trainer.num_seeds": 1})
 
 
 def moved(begun: Any, ended: Any) -> dict[str, float]:
@@ -138,6 +148,9 @@ SMALL: dict[str, Any] = {
     "trainer.eval_episodes": 4,
     "trainer.devices": 1,
 }
+# Of learners whose goals are what came later in an episode.
+WITH_FUTURES: dict[str, dict[str, Any]] = {"crl": {"hidden": [8]}, "chronosrl": {"width": 8, "blocks": 1}}
+FUTURES: dict[str, Any] = {"batch_size": 16, "buffer_size": 1280, "min_transitions": 640, "updates_per_rollout": 2}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
