@@ -66,6 +66,13 @@ MENDS = (
         "reward",
     ),
     Mend(
+        "agents stay in a sliver of the goal's region, on the wrong side of a wall",
+        "tests/abstraction/test_passages.py::test_where_no_goal_is_on_their_side_it_counts_what_agents_reach_elsewhere",
+        "star/abstraction/passages.py",
+        "jnp.where(tries.beside < TRIES, able, tries.met >= ABLE * tries.beside)",
+        "tries.met >= ABLE * jnp.maximum(tries.beside, TRIES)",
+    ),
+    Mend(
         "intervals over seeds are too narrow",
         "tests/report/test_statistics.py::test_of_normal_seeds_intervals_hold_the_truth_as_often_as_they_say",
         "star/report/statistics.py",

@@ -62,8 +62,8 @@ def compute(config: Any) -> dict[str, Any]:
 
     from star.training import program as programs
 
-    large = {key: _find(config.model_dump(mode="json"), key) for key in SMALL}
-    large |= config.model_dump(mode="json", exclude_defaults=True)
+    values = config.model_dump(mode="json")
+    large = {key: _find(values, key) for key in SMALL} | config.model_dump(mode="json", exclude_defaults=True)
     large.pop("trainer", None)  # seeds, budget and evaluations: the row itself tells them
     program = programs.build(made_small(config))
     state = program.init(program.seed_keys())
