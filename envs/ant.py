@@ -2,7 +2,7 @@
 
     state = qpos[0:15], qvel[0:14], t * .001      t in env steps
     start = qpos0 + U(-.1, .1), N(0, .1^2)        qpos0 has the torso .75 above the floor and every joint at 0
-                                                  of model `jaxgcrl` .55, ankles bent by 1 rad, x and y without noise
+                                                  of JaxGCRL's models .55, ankles bent by 1 rad, x and y without noise
                                                   (.1 unless the task has another noise)
 
 qpos is x, y, z in m, a unit quaternion (w, x, y, z), then hip and ankle of legs 1 to 4 in rad; qvel is the velocity
@@ -39,6 +39,7 @@ VELOCITY = (15, 16)  # those in the state of the torso's velocity along x and y
 QPOS, QVEL = 15, 14  # the ant's own positions and velocities; those of blocks follow
 HEALTHY = (0.2, 1.0)  # height of the torso above the floor, m
 BENT = (0.55, (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0))  # JaxGCRL's start: that height (m), and the joints (rad)
+JAXGCRL = ("jaxgcrl", "jaxgcrl_spring")  # its models
 MUJOCO_SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 ON_ITS_BACK = -0.5  # the ant is flipped when the vertical part of its own up axis is below
 LIFT = 2 * HEIGHT  # how far an open gate is lifted, m
@@ -56,8 +57,9 @@ def spec(*, action_scale: float = 1.0, collisions: str = "all", model: str = "pu
     """The ant's own model, without floor or walls. With `collisions="feet"` only torso and shins touch anything.
 
     `model="jaxgcrl"` has feet, which touch the floor, walls, torso and each other; torso and hips touch walls and feet
-    alone. Contacts have MuJoCo's own parameters, and joints are not damped implicitly. `model="gymnasium"` has these
-    parameters and all else as published.
+    alone. Contacts have MuJoCo's own parameters, and joints are not damped implicitly. `model="jaxgcrl_spring"` is the
+    same with the masses that Brax's engine `spring` takes. `model="gymnasium"` has MuJoCo's parameters of contacts and
+    all else as published.
     """
     xml = resources.files("envs").joinpath("assets", "ant.xml").read_text(encoding="utf-8")
     ant = mujoco.MjSpec.from_string(xml)
@@ -69,8 +71,10 @@ def spec(*, action_scale: float = 1.0, collisions: str = "all", model: str = "pu
     if model != "published":
         for geom in (ant.default.geom, *ant.geoms):  # the default is that of floor and walls
             geom.solimp = MUJOCO_SOLIMP
-    if model == "jaxgcrl":
+    if model in JAXGCRL:
         _as_in_jaxgcrl(ant)
+    if model == "jaxgcrl_spring":
+        _weighed_by_spring(ant)
     return ant
 
 
@@ -90,6 +94,18 @@ def _as_in_jaxgcrl(ant: mujoco.MjSpec) -> None:
             contype=1,
             conaffinity=1,
         )
+
+
+def _weighed_by_spring(ant: mujoco.MjSpec) -> None:
+    """Give each link 1 kg, and 1 kg m^2 about every axis.
+
+    Brax's `spring` raises masses and inertias to the power of 1 minus a scale, and JaxGCRL's model has 1 for both.
+    """
+    weighed = ant.copy().compile()
+    ant.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    for body in ant.bodies[1:]:
+        body.explicitinertial, body.mass, body.inertia = True, 1.0, np.ones(3)
+        body.ipos, body.iquat = weighed.body(body.name).ipos, [1.0, 0.0, 0.0, 0.0]
 
 
 def build(task: Task, engine: str, options: Mapping[str, Any]) -> Ant:
@@ -140,7 +156,7 @@ class Ant:
         self._shake = np.full(QPOS, task.pose_noise, np.float32)
         self._shake[:2] = task.place_noise
         self._start_speed = task.pose_noise
-        if model == "jaxgcrl":
+        if model in JAXGCRL:
             start[2], start[7:QPOS] = BENT
             self._shake[:2] = 0.0
         start[2] += task.arena.floor_height

@@ -22,22 +22,24 @@ AT_GOAL = (*ENDS, "new_goal")  # what success may do to it
 
 # `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
 # MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both. `jaxgcrl` is the
-# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025).
+# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025), `jaxgcrl_spring` has the masses of its `spring`.
+_JAXGCRL: Mapping[str, Any] = {
+    "model": "jaxgcrl",
+    "integrator": "euler",
+    "iterations": 1,
+    "ls_iterations": 4,
+    "timestep": 0.01,
+    "margin": 0.0,
+    "action_scale": 5.0,
+    "observe": "untimed",
+    "unhealthy": "terminate",
+    "episode_length": 1000,
+}
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 10},
     "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},
-    "jaxgcrl": {
-        "model": "jaxgcrl",
-        "integrator": "euler",
-        "iterations": 1,
-        "ls_iterations": 4,
-        "timestep": 0.01,
-        "margin": 0.0,
-        "action_scale": 5.0,
-        "observe": "untimed",
-        "unhealthy": "terminate",
-        "episode_length": 1000,
-    },
+    "jaxgcrl": _JAXGCRL,
+    "jaxgcrl_spring": {**_JAXGCRL, "model": "jaxgcrl_spring"},
 }
 
 
@@ -98,7 +100,7 @@ COMMON: Mapping[str, Option] = {
 
 ANT: Mapping[str, Option] = {
     "observe": choice("published", "full", "untimed"),
-    "model": choice("published", "jaxgcrl", "gymnasium"),
+    "model": choice("published", "jaxgcrl", "jaxgcrl_spring", "gymnasium"),
     "collisions": choice("all", "feet"),
     "margin": number(0.01, 0.0, 0.1, "m"),
     "wall_margin": number(0.0, 0.0, 0.1, "m"),

@@ -262,7 +262,7 @@ POINT_MASS = 1000 * 4 / 3 * np.pi * 0.1**3  # kg, of a ball of .1 m as dense as 
 
 
 def _jaxgcrl(body: str, arena: Arena, train: Places, test: Places, start: Places | None = None) -> Task:
-    goals, presets = {"train": train, "test": test}, ("fast", "published", "jaxgcrl")
+    goals, presets = {"train": train, "test": test}, ("fast", "published", "jaxgcrl", "jaxgcrl_spring")
     return maze(
         body, arena, success_radius=0.5, goals=goals, start=start, defaults={"reward": "sparse"}, presets=presets
     )

@@ -8,13 +8,14 @@ The first row tells losses and gradients of both at the same parameters, batch a
     gradient       largest difference of a gradient's number, in shares of the largest number of its array
     right          True if both critics find equally many goals of a batch
 
-Then a row for each ant, JaxGCRL's `ant` by backend and preset `jaxgcrl` by engine, and for actions that are `uniform`
+Then a row for each ant, JaxGCRL's `ant` by backend and its presets here by engine, and for actions that are `uniform`
 in [-1, 1] or those of the `initial` actor, which has not learnt:
 
     mass       kg of the ant
     env_steps  of ENVS ants together until their episodes end, at most STEPS of each
     ends       episodes that have ended by then
     high       those of them that have ended above 1 m; the others are below .2 m
+    speed      m/s along the ground, mean over these env steps
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from flax import struct
 from flax.training.train_state import TrainState
 
 import envs
-from envs.ant import HEALTHY
+from envs.ant import HEALTHY, JAXGCRL
 from scripts.checks.against_jaxgcrl import loaded, theirs
 from star.learners import crl
 from star.learners.futures import ReplayState, Step
@@ -46,6 +47,7 @@ from star.learners.sections import CRLConfig
 STATE, ACTION, GOAL, BATCHES = 29, 8, 2, 10
 LEAP = 1e6  # step size from which a gradient is told without loss of digits
 ENVS, STEPS = 32, 300
+STEP = 0.05  # s
 HEIGHT = 2  # index of an observation
 
 
@@ -144,22 +146,24 @@ def _apart(wanted: jax.Array, found: jax.Array) -> float:
     return float(jnp.abs(wanted - found).max() / jnp.abs(wanted).max())
 
 
-def lives(env: Any, actions: Callable[[jax.Array, jax.Array], jax.Array]) -> dict[str, int]:
-    """Counts of ants that begin together and act by `actions(observations, key)`; none begins anew."""
+def lives(env: Any, actions: Callable[[jax.Array, jax.Array], jax.Array]) -> dict[str, float]:
+    """Counts of ants that begin together and act by `actions(observations, key)`, and speed; none begins anew."""
 
     def step(carry: Any, key: jax.Array) -> tuple[Any, Any]:
         state, alive = carry
-        state = jax.vmap(env.step)(state, actions(state.obs, key))
+        before, state = state, jax.vmap(env.step)(state, actions(state.obs, key))
         height, over = state.obs[:, HEIGHT], alive & (state.done > 0)
-        return (state, alive & ~over), (alive, over, over & (height > HEALTHY[1]))
+        way = alive * jnp.linalg.norm(state.obs[:, :2] - before.obs[:, :2], axis=-1)
+        return (state, alive & ~over), (alive, over, over & (height > HEALTHY[1]), way)
 
     @jax.jit
     def run(key: jax.Array) -> Any:
         start = jax.vmap(env.reset)(jax.random.split(key, ENVS))
         return jax.lax.scan(step, (start, jnp.ones(ENVS, bool)), jax.random.split(key, STEPS))[1]
 
-    counts = map(int, map(jnp.sum, run(jax.random.key(0, impl="threefry2x32"))))
-    return dict(zip(("env_steps", "ends", "high"), counts, strict=True))
+    *counts, way = map(jnp.sum, run(jax.random.key(0, impl="threefry2x32")))
+    told = dict(zip(("env_steps", "ends", "high"), map(int, counts), strict=True))
+    return told | {"speed": round(float(way) / STEP / told["env_steps"], 3)}
 
 
 def rows(clone: Path, backends: list[str], engines: list[str]) -> list[dict[str, Any]]:
@@ -170,13 +174,14 @@ def rows(clone: Path, backends: list[str], engines: list[str]) -> list[dict[str,
         "initial": lambda obs, key: crl.act(config, state, obs, key=key),
     }
     told = []
-    for whose, name in [("JaxGCRL", name) for name in backends] + [("preset", name) for name in engines]:
+    ours = [(preset, name) for preset in JAXGCRL for name in engines]
+    for whose, name in [("JaxGCRL", name) for name in backends] + ours:
         if whose == "JaxGCRL":
             env = theirs(clone, "ant", backend=name)[0]
             masses = env.sys.link.inertia.mass[:-1]  # the last is that of the goal
             mass = (masses ** (1 - env.sys.spring_mass_scale) if name == "spring" else masses).sum()
         else:
-            env = envs.make("ant_open", preset="jaxgcrl", engine=name)
+            env = envs.make("ant_open", preset=whose, engine=name)
             mass = env.body.physics.model.body_mass.sum()
         for kind, actions in kinds.items():
             told.append(

@@ -244,6 +244,17 @@ def test_the_preset_of_jaxgcrl_gives_its_ant_and_what_is_given_by_name_wins():
     assert abs(state.obs[2] - 0.55) <= 0.1
 
 
+def test_links_weigh_as_much_as_in_spring_and_all_else_is_the_other_preset():
+    light, heavy = (made("ant_u4_maze", preset=preset).body for preset in ("jaxgcrl", "jaxgcrl_spring"))
+    model = heavy.physics.model
+    np.testing.assert_array_equal(model.body_mass[1:], np.ones(9))
+    np.testing.assert_array_equal(model.body_inertia[1:], np.ones((9, 3)))
+    for name in ("body_ipos", "geom_size", "geom_pos", "geom_contype", "dof_armature", "dof_damping", "jnt_range"):
+        np.testing.assert_array_equal(getattr(model, name), getattr(light.physics.model, name))
+    start = jitted(made("ant_u4_maze", preset="jaxgcrl_spring").reset)(jax.random.key(0)).obs
+    np.testing.assert_array_equal(start, jitted(made("ant_u4_maze", preset="jaxgcrl").reset)(jax.random.key(0)).obs)
+
+
 @pytest.mark.parametrize(("height", "over"), [(0.19, 1.0), (0.5, 0.0), (1.01, 1.0)])
 def test_an_ant_that_is_too_low_or_too_high_ends_the_episode_of_jaxgcrl(height, over):
     env = made("ant_u4_maze", preset="jaxgcrl", action_scale=2.0)
