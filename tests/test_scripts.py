@@ -135,13 +135,16 @@ def test_lives_are_counted_until_the_first_end_and_by_its_reason(monkeypatch):
     monkeypatch.setattr(script, "ENVS", 3)
     monkeypatch.setattr(script, "STEPS", 10)
 
-    def at(height):
-        zero = jnp.zeros(())
-        return State(None, jnp.zeros(3).at[2].set(height), zero, jnp.float32((height < 0.2) | (height > 1)), {})
+    def at(height, place):
+        obs, over = jnp.asarray([0.0, place, height]), (height < 0.2) | (height > 1)
+        return State(None, obs, jnp.zeros(()), jnp.float32(over), {})
 
-    climber = argparse.Namespace(reset=lambda key: at(0.5), step=lambda state, action: at(state.obs[2] + action))
+    climber = argparse.Namespace(
+        reset=lambda key: at(0.5, 0.0), step=lambda state, action: at(state.obs[2] + action, state.obs[1] + action)
+    )
     found = script.lives(climber, lambda obs, key: jnp.asarray([0.2, -0.2, 0.0]))  # 1.1 m in step 3, .1 m in step 2
-    assert found == {"env_steps": 3 + 2 + 10, "ends": 2, "high": 1}
+    speed = (3 * 0.2 + 2 * 0.2) / (3 + 2 + 10) / 0.05
+    assert found == {"env_steps": 3 + 2 + 10, "ends": 2, "high": 1, "speed": round(speed, 3)}
 
 
 def test_the_last_layer_of_our_actor_is_two_of_jaxgcrls():
