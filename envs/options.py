@@ -20,9 +20,6 @@ ENDS = ("ignore", "terminate", "truncate")  # what a mishap may do to the episod
 CELL_SIZES = (1.5, 100.0)  # m
 AT_GOAL = (*ENDS, "new_goal")  # what success may do to it
 
-# `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
-# MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both. `jaxgcrl` is the
-# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025), `jaxgcrl_spring` has the masses of its `spring`.
 _JAXGCRL: Mapping[str, Any] = {
     "model": "jaxgcrl",
     "integrator": "euler",
@@ -35,6 +32,9 @@ _JAXGCRL: Mapping[str, Any] = {
     "unhealthy": "terminate",
     "episode_length": 1000,
 }
+# `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
+# MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both. `jaxgcrl` is the
+# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025), `jaxgcrl_spring` has the masses of its `spring`.
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 10},
     "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},

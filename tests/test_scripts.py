@@ -140,7 +140,9 @@ def test_lives_are_counted_until_the_first_end_and_by_its_reason(monkeypatch):
         return State(None, obs, jnp.zeros(()), jnp.float32(over), {})
 
     climber = argparse.Namespace(
-        reset=lambda key: at(0.5, 0.0), step=lambda state, action: at(state.obs[2] + action, state.obs[1] + action)
+        dt=0.05,
+        reset=lambda key: at(0.5, 0.0),
+        step=lambda state, action: at(state.obs[2] + action, state.obs[1] + action),
     )
     found = script.lives(climber, lambda obs, key: jnp.asarray([0.2, -0.2, 0.0]))  # 1.1 m in step 3, .1 m in step 2
     speed = (3 * 0.2 + 2 * 0.2) / (3 + 2 + 10) / 0.05

@@ -47,7 +47,6 @@ from star.learners.sections import CRLConfig
 STATE, ACTION, GOAL, BATCHES = 29, 8, 2, 10
 LEAP = 1e6  # step size from which a gradient is told without loss of digits
 ENVS, STEPS = 32, 300
-STEP = 0.05  # s
 HEIGHT = 2  # index of an observation
 
 
@@ -163,7 +162,7 @@ def lives(env: Any, actions: Callable[[jax.Array, jax.Array], jax.Array]) -> dic
 
     *counts, way = map(jnp.sum, run(jax.random.key(0, impl="threefry2x32")))
     told = dict(zip(("env_steps", "ends", "high"), map(int, counts), strict=True))
-    return told | {"speed": round(float(way) / STEP / told["env_steps"], 3)}
+    return told | {"speed": round(float(way / env.dt) / told["env_steps"], 3)}
 
 
 def rows(clone: Path, backends: list[str], engines: list[str]) -> list[dict[str, Any]]:
