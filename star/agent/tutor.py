@@ -107,11 +107,15 @@ def act(
 
 
 def stands_close(task: Task, obs: Float[Array, "*batch obs"], box: Box) -> Bool[Array, "*batch"]:
-    """True where `box` is no larger than one around a goal, and wholly within half the reach of a subgoal."""
+    """True where `box` is no larger than one around a goal, and wholly within half the reach of a subgoal.
+
+    In a dimension in which the agent is between its bounds, it may be larger than that reach.
+    """
     half = (box.upper - box.lower) / 2
     small = (half <= 1.01 * task.goal_margin) | ~task.spec.in_goal()  # its corners were rounded
-    farthest = jnp.abs(box.centre - task.spec.abstract(obs)) + half
-    return jnp.all(small & (farthest <= CLOSE * task.spec.scale[: farthest.shape[-1]]), axis=-1)
+    distance = jnp.abs(box.centre - task.spec.abstract(obs))
+    near = (distance + half <= CLOSE * task.spec.scale[: distance.shape[-1]]) | (distance <= half)
+    return jnp.all(small & near, axis=-1)
 
 
 def _straight(task: Task, obs: Float[Array, "*batch obs"], point: Float[Array, "*batch d"]) -> Float[Array, "*batch p"]:

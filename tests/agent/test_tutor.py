@@ -90,6 +90,15 @@ def test_a_box_around_a_goal_close_by_is_aimed_at_and_teaches_nothing(straight):
     np.testing.assert_array_equal(learnt.weight, [0.0 if straight else 1.0, 1.0, 1.0])
 
 
+def test_a_box_higher_than_the_reach_is_close_to_who_is_between_its_bounds():
+    """As on Ant Fall: subgoals lie up to .5 m higher, and the box around the goal is 2 m high."""
+    known, goal = task((0, 1, 2), radius=5.0, reach=(10.0, 10.0, 0.5)), np.float32([0.0, 27.0, 4.5])
+    box = known.goal_box(np.tile(goal, (3, 1)))
+    here = np.float32([[3.9, 24.0, 4.8], [3.9, 24.0, 3.4], [4.1, 24.0, 4.8]])  # on the floor, in the gap, too far
+    obs = np.concatenate([here, np.tile(goal, (3, 1))], axis=1)
+    assert jax.jit(partial(tutor.stands_close, known))(obs, box).tolist() == [True, False, False]
+
+
 def test_the_reward_told_is_that_of_decisions_that_teach(monkeypatch):
     batch = SimpleNamespace(reward=jnp.array([1.0, 5.0, 9.0]), weight=jnp.array([1.0, 1.0, 0.0]))
     monkeypatch.setattr(tutor.learners, "update", lambda section, state, batch, **_: (state, {}))
