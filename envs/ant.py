@@ -3,7 +3,8 @@
     state = qpos[0:15], qvel[0:14], t * .001      t in env steps
     start = qpos0 + U(-.1, .1), N(0, .1^2)        qpos0 has the torso .75 above the floor and every joint at 0
                                                   of JaxGCRL's models .55, ankles bent by 1 rad, x and y without noise
-                                                  (.1 unless the task has another noise)
+                                                  (.1 unless the task has another noise); of `jaxgcrl_spring` raised
+                                                  until no foot is in the floor
 
 qpos is x, y, z in m, a unit quaternion (w, x, y, z), then hip and ankle of legs 1 to 4 in rad; qvel is the velocity
 of the torso in m/s (world frame), its angular velocity in rad/s (body frame), then the 8 joint velocities. Actions
@@ -40,6 +41,8 @@ QPOS, QVEL = 15, 14  # the ant's own positions and velocities; those of blocks f
 HEALTHY = (0.2, 1.0)  # height of the torso above the floor, m
 BENT = (0.55, (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0))  # JaxGCRL's start: that height (m), and the joints (rad)
 JAXGCRL = ("jaxgcrl", "jaxgcrl_spring")  # its models, and the presets of the same names
+LEGS = ((1, 1), (-1, 1), (-1, -1), (1, -1))  # which way along x and y each points
+FOOT = 0.08  # radius of JaxGCRL's feet, m
 MUJOCO_SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 ON_ITS_BACK = -0.5  # the ant is flipped when the vertical part of its own up axis is below
 LIFT = 2 * HEIGHT  # how far an open gate is lifted, m
@@ -84,12 +87,12 @@ def _as_in_jaxgcrl(ant: mujoco.MjSpec) -> None:
     for geom in ant.geoms:
         touching = geom.name.startswith(("torso", "hip"))
         geom.contype, geom.conaffinity = (scene.TORSO, 1) if touching else (0, 0)
-    for leg, (x, y) in enumerate(((1, 1), (-1, 1), (-1, -1), (1, -1)), start=1):
+    for leg, (x, y) in enumerate(LEGS, start=1):
         ant.body(f"shin_{leg}").add_geom(
             name=f"foot_{leg}",
             type=mujoco.mjtGeom.mjGEOM_SPHERE,
             pos=[0.4 * x, 0.4 * y, 0.0],
-            size=[0.08, 0.0, 0.0],
+            size=[FOOT, 0.0, 0.0],
             mass=0.0,
             contype=1,
             conaffinity=1,
@@ -106,6 +109,19 @@ def _weighed_by_spring(ant: mujoco.MjSpec) -> None:
     for body in ant.bodies[1:]:
         body.explicitinertial, body.mass, body.inertia = True, 1.0, np.ones(3)
         body.ipos, body.iquat = weighed.body(body.name).ipos, [1.0, 0.0, 0.0, 0.0]
+
+
+def soles(qpos: jax.Array) -> jax.Array:
+    """The height [4] of the lowest point of each of JaxGCRL's feet, m, of the ant at `qpos` [15]."""
+    hip, ankle = qpos[7:QPOS:2], qpos[8:QPOS:2]
+    root = 0.2 * jnp.asarray(LEGS)  # of each thigh; a thigh is as long as its way from the torso's middle, a shin twice
+    sine, cosine = jnp.sin(hip)[:, None], jnp.cos(hip)[:, None]
+    thigh = cosine * root + sine * root[:, ::-1] * jnp.array([-1.0, 1.0])
+    below = 0.4 * jnp.sqrt(2.0) * jnp.sin(ankle) * jnp.array([1.0, -1.0, -1.0, 1.0])
+    foot = jnp.concatenate([root + thigh * (1.0 + 2.0 * jnp.cos(ankle))[:, None], -below[:, None]], axis=1)
+    w, x, y, z = qpos[3:7]
+    up = jnp.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x**2 + y**2)])
+    return qpos[2] + foot @ up - FOOT
 
 
 def build(task: Task, engine: str, options: Mapping[str, Any]) -> Ant:
@@ -159,6 +175,7 @@ class Ant:
         if model in JAXGCRL:
             start[2], start[7:QPOS] = BENT
             self._shake[:2] = 0.0
+        self._raised = model == "jaxgcrl_spring"  # MuJoCo would throw it up, which `spring` does not
         start[2] += task.arena.floor_height
         self._start = start.astype(np.float32)
         slides = 2 * (len(start) - QPOS)
@@ -175,6 +192,8 @@ class Ant:
         noise = self._shake * jax.random.uniform(qpos_rng, (QPOS,), minval=-1.0, maxval=1.0)
         qpos = jnp.asarray(self._start).at[:QPOS].add(noise).at[:2].add(position)
         qpos = qpos.at[3:7].divide(jnp.linalg.norm(qpos[3:7]))
+        if self._raised:
+            qpos = qpos.at[2].add(jnp.maximum(self._arena.floor_height - soles(qpos[:QPOS]).min(), 0.0))
         if self._block_noise:
             first_x = QPOS + len(self._arena.block) * np.arange(self._blocks)
             qpos = qpos.at[first_x].add(self._block_noise * jax.random.normal(block_rng, first_x.shape))

@@ -52,6 +52,20 @@ MENDS = (
         "config.commander.goal_margin",
     ),
     Mend(
+        "a goal whose box is higher than subgoals reach is never close, so that agents on Ant Fall leave it",
+        "tests/agent/test_tutor.py::test_a_box_higher_than_the_reach_is_close_to_who_is_between_its_bounds",
+        "star/agent/tutor.py",
+        " | (distance <= half)",
+        "",
+    ),
+    Mend(
+        "feet of JaxGCRL's ant begin in the floor, and MuJoCo throws it up",
+        "tests/envs/test_tasks.py::test_the_heavy_ant_begins_with_no_foot_in_the_floor_and_else_as_the_other",
+        "envs/ant.py",
+        "        if self._raised:",
+        "        if False:",
+    ),
+    Mend(
         "Q-learning learns nothing from periods that the task ended",
         "tests/agent/test_commander.py::test_q_learning_averages_the_errors_of_each_cell",
         "star/agent/q_learning.py",

@@ -5,6 +5,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from scipy import stats
@@ -251,8 +252,24 @@ def test_links_weigh_as_much_as_in_spring_and_all_else_is_the_other_preset():
     np.testing.assert_array_equal(model.body_inertia[1:], np.ones((9, 3)))
     for name in ("body_ipos", "geom_size", "geom_pos", "geom_contype", "dof_armature", "dof_damping", "jnt_range"):
         np.testing.assert_array_equal(getattr(model, name), getattr(light.physics.model, name))
-    start = jitted(made("ant_u4_maze", preset="jaxgcrl_spring").reset)(jax.random.key(0)).obs
-    np.testing.assert_array_equal(start, jitted(made("ant_u4_maze", preset="jaxgcrl").reset)(jax.random.key(0)).obs)
+
+
+def test_the_heavy_ant_begins_with_no_foot_in_the_floor_and_else_as_the_other():
+    """MuJoCo would throw it up."""
+    starts, env = [], made("ant_u4_maze", preset="jaxgcrl_spring")
+    for one in (made("ant_u4_maze", preset="jaxgcrl"), env):
+        starts.append(jitted(jax.vmap(one.reset))(jax.random.split(jax.random.key(0), 64)).obs)
+    light, heavy = map(np.asarray, starts)
+    np.testing.assert_array_equal(np.delete(light, 2, axis=1), np.delete(heavy, 2, axis=1))
+    model = env.body.physics.model
+    data, depth = mujoco.MjData(model), []
+    for start in (*light, *heavy):
+        data.qpos[:15] = start[:15]
+        mujoco.mj_kinematics(model, data)
+        depth.append(min(data.geom(f"foot_{leg}").xpos[2] for leg in range(1, 5)) - 0.08)
+    before, after = np.split(np.array(depth), 2)
+    np.testing.assert_allclose(after, np.maximum(before, 0.0), atol=1e-6)
+    assert (before < -0.05).mean() > 0.5
 
 
 @pytest.mark.parametrize(("height", "over"), [(0.19, 1.0), (0.5, 0.0), (1.01, 1.0)])
