@@ -45,14 +45,15 @@ class Regions(NamedTuple):
 class _Episode:
     """State of the hierarchy in the episodes of B bodies, after `steps` env steps.
 
-    `plan` is what the Controller has decided for the next env steps. `before` is the last observation [B, n], and
-    `shape` its leading axes as they were given: [] or [B].
+    `explore` is True for those whose actions have noise, `plan` what the Controller has decided for the next env steps.
+    `before` is the last observation [B, n], and `shape` its leading axes as they were given: [] or [B].
     """
 
     state: TrainState
     roadmap: Roadmap
     memory: Memory
     keys: Array
+    explore: Any = False
     subgoal: Any = None
     plan: Any = None
     before: Any = None
@@ -121,12 +122,13 @@ class TrainedAgent:
         segment, within = divmod(episode.steps, self.config.tutor.period)
         spec, hyper = self.spec, self._program.hyper
         if within == 0:
-            episode.memory, episode.subgoal, action, episode.plan = _decide(
+            episode.memory, episode.explore, episode.subgoal, action, episode.plan = _decide(
                 spec, hyper, episode.state, episode.roadmap, episode.memory, batch, episode.keys[segment]
             )
         else:
+            now = batch, episode.plan, within, episode.explore, episode.keys[segment]
             episode.subgoal, action, episode.plan = _go_on(
-                spec, hyper, episode.state, episode.subgoal, episode.before, batch, episode.plan, within
+                spec, hyper, episode.state, episode.subgoal, episode.before, *now
             )
         episode.before, episode.steps = batch, episode.steps + 1
         episode.shape = given.shape[:-1]
@@ -238,15 +240,17 @@ def _decide(
     memory: Memory,
     obs: Float[Array, "B n"],
     keys: Key[Array, "3"],
-) -> tuple[Memory, Array, Array, Array]:
-    """The first env step of a segment: memory for the next one, subgoal, action, and the Controller's plan."""
+) -> tuple[Memory, Any, Array, Array, Array]:
+    """The first env step of a segment: memory for the next one, who explores, subgoal, action and plan."""
     agent = levels.of(config, spec, greedy=True)
-    memory, _, _, choice = hierarchy.decide(
+    memory, _, _, choice, explore = hierarchy.decide(
         agent, state, roadmap, memory, (), obs, spec.success(obs), env_steps=None, keys=(keys[0], keys[1], keys[2])
     )
     memory = agent.commander.tick(config.commander, memory, steps=config.tutor.period)
     seen, plan = hierarchy.observe(agent, obs, choice.subgoal), hierarchy.no_plan(agent, len(obs))
-    return memory, choice.subgoal, *hierarchy.act(agent, state, seen, plan, number=0, explore=False, key=keys[2])
+    key = _step_key(config, keys, 0)
+    action, plan = hierarchy.act(agent, state, seen, plan, number=0, explore=explore, key=key)
+    return memory, explore, choice.subgoal, action, plan
 
 
 @partial(jax.jit, static_argnames="spec")  # agents of one kind share it
@@ -259,12 +263,20 @@ def _go_on(
     obs: Array,
     plan: Array,
     number: Array,
+    explore: Array,
+    keys: Key[Array, "3"],
 ) -> tuple[Array, Array, Array]:
     """Env step `number` of a segment, not the first: subgoal, action and plan."""
     agent = levels.of(config, spec, greedy=True)
     subgoal = hierarchy.follow(agent, subgoal, before, obs)
     seen = hierarchy.observe(agent, obs, subgoal)
-    return subgoal, *hierarchy.act(agent, state, seen, plan, number=number, explore=False, key=state.key)
+    key = _step_key(config, keys, number)
+    return subgoal, *hierarchy.act(agent, state, seen, plan, number=number, explore=explore, key=key)
+
+
+def _step_key(config: AgentConfig, keys: Key[Array, "3"], number: Array | int) -> Array:
+    """The Controller's key of env step `number` of a segment, as in `play.rollout`."""
+    return jax.random.split(keys[2], config.tutor.period)[number]
 
 
 def _exported(spec: Spec, config: AgentConfig, state: TrainState) -> bytearray:

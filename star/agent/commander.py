@@ -7,7 +7,8 @@
     observe     the decisions of an instant, by `planning` or `q_learning`
     follow      once an epoch: the regions may have been cut
 
-Greedy episodes explore nothing, and follow a plan of their own (`settle`).
+Greedy episodes explore nothing, and follow a plan of their own (`settle`). But where the agent stands still (`standing`)
+Tutor and Controller act with noise.
 
 Source: STAR (ICLR 2024), section 4.1.
 """
@@ -34,6 +35,8 @@ from star.learners.replay import weighted_mean
 from star.sgim.lessons import Marks
 
 Metrics = dict[str, Array]
+
+STILL = 0.05  # of the farthest subgoal in each dimension: who has moved less stands still
 
 _RULES = {"model": planning, "q": q_learning}
 
@@ -164,6 +167,16 @@ def experience(
     )
     box = memory.box
     return memory, Finished(decision, Outcome(memory.start, box.lower, box.upper, end, weight))
+
+
+def standing(task: Task, memory: Memory, scene: Scene) -> Bool[Array, "B"]:
+    """True for those whom the period under way has not moved, though the goal is not reached.
+
+    Greedy policies may come to rest where no action changes what they see. Training's noise gets them out.
+    """
+    moved = jnp.abs(scene.position - memory.start)
+    least = STILL * task.spec.scale[: moved.shape[-1]]
+    return (memory.clock > 0) & jnp.all(moved < least, axis=-1) & (scene.success == 0)
 
 
 def tick(section: CommanderConfig, memory: Memory, *, steps: int) -> Memory:

@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from envs.common.batching import where
 from star import learners
@@ -80,13 +80,18 @@ def observe(
 
 
 def act(
-    section: ControllerConfig, state: Any, seen: Float[Array, "*batch seen"], *, explore: bool, key: Array
+    section: ControllerConfig,
+    state: Any,
+    seen: Float[Array, "*batch seen"],
+    *,
+    explore: bool | Bool[Array, "*batch"],
+    key: Array,
 ) -> Float[Array, "*batch acts"]:
     """Actions for what is `seen`; the environment clips them to [-1, 1].
 
     A learner that decides for `chunk` env steps at once gives the actions of all of them, one after another.
     """
-    return learners.act(section, state, seen, deterministic=not explore, key=key)
+    return learners.act(section, state, seen, explore=explore, key=key)
 
 
 def policy(section: ControllerConfig, task: Task, state: Any, *, key: Array) -> Policy:

@@ -15,7 +15,7 @@ from star.agent.sections import CommanderConfig
 from star.agent.segments import Segment
 from star.agent.task import Task
 
-__all__ = ["begin", "command", "experience", "init", "observe", "renewed", "settle", "tick"]
+__all__ = ["begin", "command", "experience", "init", "observe", "renewed", "settle", "standing", "tick"]
 
 
 def command(
@@ -50,6 +50,11 @@ def renewed(memory: Memory) -> Bool[Array, "B"]:
 def observe(section: CommanderConfig, state: Any, *_: Any, **__: Any) -> Any:
     """Nothing is learnt."""
     return state
+
+
+def standing(*_: Any) -> bool:
+    """Nobody explores in greedy episodes, as in those of HIRO, HRAC and flat agents."""
+    return False
 
 
 def settle(section: CommanderConfig, state: Any, *_: Any, **__: Any) -> Any:

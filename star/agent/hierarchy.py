@@ -1,7 +1,7 @@
 """One env step of the hierarchy, whoever moves the body: `play` in simulated environments, `acting` from observations.
 
 prepare   before a greedy episode: the Commander as it acts there, and its roadmap
-decide    every l env steps: the Commander's target where a period begins, and the Tutor's subgoal
+decide    every l env steps: the Commander's target where a period begins, the Tutor's subgoal, and who explores
 follow    after every env step: the subgoal moves with the agent
 act       at every env step: the Controller, which may decide for some env steps at once
 """
@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from star.agent.decisions import Memory, Roadmap, Scene
 from star.agent.levels import Agent
@@ -49,10 +49,11 @@ def decide(
     *,
     env_steps: Float[Array, ""] | None,
     keys: Keys,
-) -> tuple[Memory, Any, Marks, Choice]:
+) -> tuple[Memory, Any, Marks, Choice, bool | Bool[Array, "B"]]:
     """Command where a period begins, and choose a subgoal; with what SGIM had to say, and its lesson after that.
 
-    `success` is 1 where the goal counts as reached; `env_steps` are as for `play.segment`.
+    Last comes who explores in these l env steps: in training all, in greedy episodes those who stand still short of the
+    goal. `success` is 1 where the goal counts as reached; `env_steps` are as for `play.segment`.
     """
     config, task = agent.config, agent.task
     scene = Scene(task.spec.abstract(obs), task.spec.goal_point(obs), success)
@@ -60,9 +61,9 @@ def decide(
     memory = agent.commander.command(
         config.commander, task, state.commander, roadmap, memory, scene, marks, env_steps=env_steps, key=keys[0]
     )
-    explore = env_steps is not None
+    explore = env_steps is not None or agent.commander.standing(task, memory, scene)
     choice = agent.tutor.act(config.tutor, task, state.tutor, obs, memory.box, marks, explore=explore, key=keys[1])
-    return memory, lesson, marks, choice
+    return memory, lesson, marks, choice, explore
 
 
 def observe(agent: Agent, obs: Float[Array, "B obs"], subgoal: Float[Array, "B m"]) -> Float[Array, "B seen"]:
@@ -90,7 +91,7 @@ def act(
     plan: Float[Array, "B chunk act"],
     *,
     number: Array | int,
-    explore: bool,
+    explore: bool | Bool[Array, "B"],
     key: Array,
 ) -> tuple[Float[Array, "B act"], Float[Array, "B chunk act"]]:
     """The Controller's actions, and its plan after them, given that of the env step before.

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from envs._quiet import State as EnvState
 from envs.common.batching import where
@@ -152,7 +152,7 @@ def segment(
     `env_steps` are those of all environments before the epoch, None in greedy episodes. `keys` are three: of Commander,
     Tutor and Controller.
     """
-    memory, lesson, marks, choice = hierarchy.decide(
+    memory, lesson, marks, choice, explore = hierarchy.decide(
         agent,
         state,
         roadmap,
@@ -164,7 +164,6 @@ def segment(
         keys=keys,
     )
     streams = streams.replace(memory=memory, lesson=lesson)
-    explore = env_steps is not None
     streams, passed = rollout(agent, env, state, streams, choice, explore=explore, record=record, key=keys[2])
     return streams, passed, marks
 
@@ -176,7 +175,7 @@ def rollout(
     streams: Streams,
     choice: Choice,
     *,
-    explore: bool,
+    explore: bool | Bool[Array, "B"],
     record: Record | None = None,
     key: Array,
 ) -> tuple[Streams, Segment]:

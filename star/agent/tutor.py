@@ -90,12 +90,12 @@ def act(
     box: Box,
     marks: Marks,
     *,
-    explore: bool,
+    explore: bool | Bool[Array, "B"],
     key: Array,
 ) -> Choice:
     """A subgoal for each environment, on the way to its target `box`: drawn to `explore`, else the mean."""
     seen = observe(section, task, obs, box)
-    action = learners.act(section, state, seen, deterministic=not explore, key=key)
+    action = learners.act(section, state, seen, explore=explore, key=key)
     if section.straight:
         action = jnp.where(stands_close(task, obs, box)[:, None], _straight(task, obs, box.centre), action)
     if marks.way is not None and marks.way.led is not None:

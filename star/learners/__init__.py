@@ -10,9 +10,11 @@ The levels know learners by the functions below alone.
 from __future__ import annotations
 
 import importlib
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
 
 from envs.common import plugins
 from star.learners.protocol import WHOLE, Learner, LearnerConfig, Rollout
@@ -37,10 +39,18 @@ def init(key: Array, section: LevelConfig, *, example: Transition) -> Any:
 
 
 def act(
-    section: LevelConfig, state: Any, obs: Float[Array, "*batch obs"], *, deterministic: bool = False, key: Array
+    section: LevelConfig,
+    state: Any,
+    obs: Float[Array, "*batch obs"],
+    *,
+    explore: bool | Bool[Array, "*batch"] = True,
+    key: Array,
 ) -> Float[Array, "*batch act"]:
-    """Actions; meaningful in [-1, 1], and to be clipped to it by whoever executes them."""
-    return find(section.learner).act(section.settings, state, obs, deterministic=deterministic, key=key)
+    """Actions, with noise to `explore`; meaningful in [-1, 1], and to be clipped to it by whoever executes them."""
+    choose = partial(find(section.learner).act, section.settings, state, obs, key=key)
+    if isinstance(explore, bool):
+        return choose(deterministic=not explore)
+    return jnp.where(explore[..., None], choose(deterministic=False), choose(deterministic=True))
 
 
 def update(

@@ -89,25 +89,27 @@ def test_an_agent_of_the_package_is_loaded_by_its_name_unless_there_is_a_folder_
         star.load("point_maze")
 
 
-def test_the_seed_of_an_episode_decides_between_commands_of_equal_worth(agent):
-    still, state = np.zeros(agent.observation_size), agent._state
-    still[slice(*GOAL)] = 8.0
+def test_the_seed_of_an_episode_decides_between_commands_of_equal_worth_and_how_to_move_on(agent):
+    still, state = np.zeros((STEPS, agent.observation_size)), agent._state
+    still[:, slice(*GOAL)] = 8.0
+    walking = still + np.arange(STEPS)[:, None] * np.eye(agent.observation_size)[0]
 
-    def acted(seed):
+    def acted(seed, seen):
         agent.reset(seed)
-        return np.stack([agent.act(still) for _ in range(STEPS)])
+        return np.stack([agent.act(obs) for obs in seen])
 
-    def different():
-        return len({acted(seed).tobytes() for seed in range(5)})
+    def different(seen=walking):
+        return len({acted(seed, seen).tobytes() for seed in range(5)})
 
     assert different() > 1
-    np.testing.assert_array_equal(acted(1), acted(1))
+    np.testing.assert_array_equal(acted(1, walking), acted(1, walking))
     model = state.commander.model
     told = model.replace(rewards=np.zeros_like(model.rewards), visits=np.full_like(model.visits, 1e6))
     told.rewards[..., 0] = 1e6  # to be sent to region 0 pays
     agent._state = state.replace(commander=state.commander.replace(model=told))
     try:
         assert different() == 1
+        assert different(still) > 1  # who stands still acts with noise
     finally:
         agent._state = state
 

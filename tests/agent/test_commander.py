@@ -12,7 +12,7 @@ from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.regions import Change, Near, Places
 from star.agent import commander, planning, values
-from star.agent.decisions import Decision, Finished, Roadmap, Successors, successors
+from star.agent.decisions import Decision, Finished, Roadmap, Scene, Successors, successors
 from star.agent.segments import Segment
 from star.agent.task import Task
 from star.agent.values import CommanderState, Model
@@ -68,6 +68,26 @@ def counted(chosen, state, batch):
 
 def settings(**values):
     return loading.parse({"commander": values}).commander
+
+
+def test_who_has_hardly_moved_within_a_period_stands_still_unless_at_the_goal():
+    spec = Spec(
+        state_dim=3,
+        action_size=1,
+        episode_length=1,
+        abstract_indices=(0, 1),
+        goal_indices=(0, 1),
+        subgoal_scale=(10.0, 5.0, 1.0),  # with a heading
+        space=((0.0, 0.0), (90.0, 90.0)),
+        region_cuts=((), ()),
+        success_radius=1.0,
+    )
+    began = np.tile(np.float32([3.0, 4.0]), (6, 1))
+    moved = np.float32([[0.4, -0.2], [0.6, 0.0], [0.0, -0.3], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    memory = commander.begin(began).replace(clock=np.int32([10, 10, 10, 40, 0, 10]))
+    scene = Scene(position=began + moved, goal=began, success=np.float32([0, 0, 0, 0, 0, 1]))
+    standing = jax.jit(partial(commander.standing, Task.of(loading.parse({}), spec)))(memory, scene)
+    assert standing.tolist() == [True, False, False, True, False, False]
 
 
 def random_batch(seed):
