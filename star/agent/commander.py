@@ -7,7 +7,7 @@
     observe     the decisions of an instant, by `planning` or `q_learning`
     follow      once an epoch: the regions may have been cut
 
-Greedy episodes explore nothing, and follow a plan of their own (`settle`). But where the agent stands still (`standing`)
+Greedy episodes explore nothing, and follow a plan of their own (`settle`). But where an agent stands still (`standing`)
 Tutor and Controller act with noise.
 
 Source: STAR (ICLR 2024), section 4.1.
