@@ -100,7 +100,8 @@ class TrainedAgent:
     def reset(self, seed: int = 0) -> None:
         """Begin an episode with the next observation.
 
-        `seed` is the `--evaluation-seed` of `star evaluate`: it decides between commands of equal worth.
+        `seed` is the `--evaluation-seed` of `star evaluate`: it decides between commands of equal worth,
+        and how an agent that stands still moves on.
         """
         keys = self._program.evaluation_keys(seed, stream=programs.AFTERWARDS)
         self._key, self._episode = keys[self._program.seeds.index(self.seed)], None
