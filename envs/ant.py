@@ -30,6 +30,7 @@ import numpy as np
 from envs import scene
 from envs.arena import BLOCK, HEIGHT
 from envs.maze import uprightness, yaw
+from envs.options import JAXGCRL
 from envs.physics import Physics, PhysicsState
 from envs.tasks import Switch, Task
 
@@ -40,7 +41,6 @@ VELOCITY = (15, 16)  # those in the state of the torso's velocity along x and y
 QPOS, QVEL = 15, 14  # the ant's own positions and velocities; those of blocks follow
 HEALTHY = (0.2, 1.0)  # height of the torso above the floor, m
 BENT = (0.55, (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0))  # JaxGCRL's start: that height (m), and the joints (rad)
-JAXGCRL = ("jaxgcrl", "jaxgcrl_spring")  # its models, and the presets of the same names
 LEGS = ((1, 1), (-1, 1), (-1, -1), (1, -1))  # which way along x and y each points
 FOOT = 0.08  # radius of JaxGCRL's feet, m
 MUJOCO_SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
@@ -114,13 +114,14 @@ def _weighed_by_spring(ant: mujoco.MjSpec) -> None:
 def soles(qpos: jax.Array) -> jax.Array:
     """The height [4] of the lowest point of each of JaxGCRL's feet, m, of the ant at `qpos` [15]."""
     hip, ankle = qpos[7:QPOS:2], qpos[8:QPOS:2]
-    root = 0.2 * jnp.asarray(LEGS)  # of each thigh; a thigh is as long as its way from the torso's middle, a shin twice
+    sides = jnp.asarray(LEGS)
+    root = 0.2 * sides  # of each thigh; a thigh is as long as its way from the torso's middle, a shin twice
     sine, cosine = jnp.sin(hip)[:, None], jnp.cos(hip)[:, None]
     thigh = cosine * root + sine * root[:, ::-1] * jnp.array([-1.0, 1.0])
-    below = 0.4 * jnp.sqrt(2.0) * jnp.sin(ankle) * jnp.array([1.0, -1.0, -1.0, 1.0])
+    below = 0.4 * jnp.sqrt(2.0) * jnp.sin(ankle) * sides[:, 0]
     foot = jnp.concatenate([root + thigh * (1.0 + 2.0 * jnp.cos(ankle))[:, None], -below[:, None]], axis=1)
     w, x, y, z = qpos[3:7]
-    up = jnp.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x**2 + y**2)])
+    up = jnp.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), uprightness(qpos[3:7])])
     return qpos[2] + foot @ up - FOOT
 
 

@@ -20,8 +20,8 @@ ENDS = ("ignore", "terminate", "truncate")  # what a mishap may do to the episod
 CELL_SIZES = (1.5, 100.0)  # m
 AT_GOAL = (*ENDS, "new_goal")  # what success may do to it
 
+JAXGCRL = ("jaxgcrl", "jaxgcrl_spring")  # models of its ant, and the presets of the same names
 _JAXGCRL: Mapping[str, Any] = {
-    "model": "jaxgcrl",
     "integrator": "euler",
     "iterations": 1,
     "ls_iterations": 4,
@@ -39,8 +39,7 @@ _JAXGCRL: Mapping[str, Any] = {
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 10},
     "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},
-    "jaxgcrl": _JAXGCRL,
-    "jaxgcrl_spring": {**_JAXGCRL, "model": "jaxgcrl_spring"},
+    **{name: {**_JAXGCRL, "model": name} for name in JAXGCRL},
 }
 
 
@@ -101,7 +100,7 @@ COMMON: Mapping[str, Option] = {
 
 ANT: Mapping[str, Option] = {
     "observe": choice("published", "full", "untimed"),
-    "model": choice("published", "jaxgcrl", "jaxgcrl_spring", "gymnasium"),
+    "model": choice("published", *JAXGCRL, "gymnasium"),
     "collisions": choice("all", "feet"),
     "margin": number(0.01, 0.0, 0.1, "m"),
     "wall_margin": number(0.0, 0.0, 0.1, "m"),

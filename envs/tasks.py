@@ -15,7 +15,7 @@ import numpy as np
 from envs import arena as arenas
 from envs import layouts
 from envs.arena import BLOCK, CHASM, FREE, GATE, GOAL, ROBOT, Arena
-from envs.options import ANT, COMMON, ENGINES, MAP, EnvError, Option, choice
+from envs.options import ANT, COMMON, ENGINES, JAXGCRL, MAP, EnvError, Option, choice
 from envs.places import Places, Point, anywhere, around, box, centres, circle, pairs, point, scaled
 
 CLEARANCE = {"ant": 1.0, "point": 0.6}  # m that a body keeps from the sides of a cell when it starts anywhere
@@ -262,7 +262,7 @@ POINT_MASS = 1000 * 4 / 3 * np.pi * 0.1**3  # kg, of a ball of .1 m as dense as 
 
 
 def _jaxgcrl(body: str, arena: Arena, train: Places, test: Places, start: Places | None = None) -> Task:
-    goals, presets = {"train": train, "test": test}, ("fast", "published", "jaxgcrl", "jaxgcrl_spring")
+    goals, presets = {"train": train, "test": test}, ("fast", "published", *JAXGCRL)
     return maze(
         body, arena, success_radius=0.5, goals=goals, start=start, defaults={"reward": "sparse"}, presets=presets
     )

@@ -37,7 +37,8 @@ from flax import struct
 from flax.training.train_state import TrainState
 
 import envs
-from envs.ant import HEALTHY, JAXGCRL
+from envs.ant import HEALTHY
+from envs.options import JAXGCRL
 from scripts.checks.against_jaxgcrl import loaded, theirs
 from star.learners import crl
 from star.learners.futures import ReplayState, Step

@@ -127,9 +127,17 @@ class TrainedAgent:
                 spec, hyper, episode.state, episode.roadmap, episode.memory, batch, episode.keys[segment]
             )
         else:
-            now = batch, episode.plan, within, episode.explore, episode.keys[segment]
             episode.subgoal, action, episode.plan = _go_on(
-                spec, hyper, episode.state, episode.subgoal, episode.before, *now
+                spec,
+                hyper,
+                episode.state,
+                episode.subgoal,
+                episode.before,
+                batch,
+                episode.plan,
+                within,
+                episode.explore,
+                episode.keys[segment],
             )
         episode.before, episode.steps = batch, episode.steps + 1
         episode.shape = given.shape[:-1]
@@ -249,7 +257,7 @@ def _decide(
     )
     memory = agent.commander.tick(config.commander, memory, steps=config.tutor.period)
     seen, plan = hierarchy.observe(agent, obs, choice.subgoal), hierarchy.no_plan(agent, len(obs))
-    key = _step_key(config, keys, 0)
+    key = hierarchy.step_keys(agent, keys[2])[0]
     action, plan = hierarchy.act(agent, state, seen, plan, number=0, explore=explore, key=key)
     return memory, explore, choice.subgoal, action, plan
 
@@ -271,13 +279,8 @@ def _go_on(
     agent = levels.of(config, spec, greedy=True)
     subgoal = hierarchy.follow(agent, subgoal, before, obs)
     seen = hierarchy.observe(agent, obs, subgoal)
-    key = _step_key(config, keys, number)
+    key = hierarchy.step_keys(agent, keys[2])[number]
     return subgoal, *hierarchy.act(agent, state, seen, plan, number=number, explore=explore, key=key)
-
-
-def _step_key(config: AgentConfig, keys: Key[Array, "3"], number: Array | int) -> Array:
-    """The Controller's key of env step `number` of a segment, as in `play.rollout`."""
-    return jax.random.split(keys[2], config.tutor.period)[number]
 
 
 def _exported(spec: Spec, config: AgentConfig, state: TrainState) -> bytearray:

@@ -38,6 +38,11 @@ def segment_keys(key: Array, segments: int) -> tuple[Array, Array]:
     return begin_key, jax.vmap(lambda one: jax.random.split(one, 3))(jax.random.split(scan_key, segments))
 
 
+def step_keys(agent: Agent, key: Array) -> Array:
+    """From the Controller's key of a segment: those of its env steps [l]."""
+    return jax.random.split(key, agent.config.tutor.period)
+
+
 def decide(
     agent: Agent,
     state: TrainState,

@@ -209,7 +209,7 @@ def rollout(
     plan, numbers = hierarchy.no_plan(agent, len(seen)), jnp.arange(agent.config.tutor.period)
     carry = (streams.env, choice.subgoal, seen, plan, 1 - streams.env.done, streams.episode)
     (env_state, _, _, _, _, episode), (steps, ends) = jax.lax.scan(
-        step, carry, (numbers, jax.random.split(key, len(numbers)))
+        step, carry, (numbers, hierarchy.step_keys(agent, key))
     )
     first = {"obs": streams.env.obs, "subgoal": choice.subgoal, "seen": seen}
     path: dict[str, Array] = jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, ends)

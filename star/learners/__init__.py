@@ -43,7 +43,7 @@ def act(
     state: Any,
     obs: Float[Array, "*batch obs"],
     *,
-    explore: bool | Bool[Array, "*batch"] = True,
+    explore: bool | Bool[Array, "*batch"],
     key: Array,
 ) -> Float[Array, "*batch act"]:
     """Actions, with noise to `explore`; meaningful in [-1, 1], and to be clipped to it by whoever executes them."""

@@ -70,18 +70,16 @@ def settings(**values):
     return loading.parse({"commander": values}).commander
 
 
+def plane(*, subgoal_scale=(1.0, 1.0)):
+    """A task on a square of 9 m, with episodes of 6 env steps."""
+    return Spec(
+        state_dim=2, action_size=1, episode_length=6, abstract_indices=(0, 1), goal_indices=(0, 1), success_radius=1.0,
+        subgoal_scale=subgoal_scale, space=((0.0, 0.0), (9.0, 9.0)), region_cuts=((), ()),
+    )  # fmt: skip
+
+
 def test_who_has_hardly_moved_within_a_period_stands_still_unless_at_the_goal():
-    spec = Spec(
-        state_dim=3,
-        action_size=1,
-        episode_length=1,
-        abstract_indices=(0, 1),
-        goal_indices=(0, 1),
-        subgoal_scale=(10.0, 5.0, 1.0),  # with a heading
-        space=((0.0, 0.0), (90.0, 90.0)),
-        region_cuts=((), ()),
-        success_radius=1.0,
-    )
+    spec = plane(subgoal_scale=(10.0, 5.0, 1.0))  # with a heading
     began = np.tile(np.float32([3.0, 4.0]), (6, 1))
     moved = np.float32([[0.4, -0.2], [0.6, 0.0], [0.0, -0.3], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     memory = commander.begin(began).replace(clock=np.int32([10, 10, 10, 40, 0, 10]))
@@ -467,10 +465,7 @@ def test_the_reward_of_a_period_is_the_max_or_mean_over_all_its_steps(reward):
 def test_a_period_that_success_ends_counts_as_if_the_agent_stayed_for_the_rest_of_it(reward, clock):
     """A segment of two env steps in a period of six: one arrives at once, one flips, one goes on."""
     chosen = loading.parse({"commander": {"reward": reward, "period": 6}, "tutor": {"period": 2}}).commander
-    spec = Spec(
-        state_dim=2, action_size=1, episode_length=6, abstract_indices=(0, 1), goal_indices=(0, 1), success_radius=1.0,
-        subgoal_scale=(1.0, 1.0), space=((0.0, 0.0), (9.0, 9.0)), region_cuts=((), ()),
-    )  # fmt: skip
+    spec = plane()
     task, table = Task.of(loading.parse({}), spec), regions.create(spec.space, [[3.0], []], max_regions=2)
     obs, end = np.full((3, 3, 4), 5.0, np.float32), np.float32([[1, 0, 0], [0, 0, 0]])
     obs[0, ..., :2] = 1.0  # in the other region
