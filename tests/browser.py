@@ -59,6 +59,8 @@ class Browser:
 
     def open(self, page, *, width=1280, height=900, dark=False):
         """Open a file or an address, and wait until it is drawn."""
+        self.send("Page.navigate", url="about:blank")  # so that no page before it asks for anything more
+        _wait(lambda: {True: True}[self.run("location.href === 'about:blank'")])
         self.problems, self.requests = [], []
         phone = width < 600
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)

@@ -629,13 +629,18 @@ function watch() {
   }
   history.scrollRestoration = "manual";
   document.documentElement.style.overflowAnchor = "none";
-  const place = sessionStorage.getItem("scroll");
-  if (place !== null) setTimeout(() => scrollTo(0, place), 100);  // once all charts have their height
+  let place = sessionStorage.getItem("scroll");  // null once the page stands there
+  const settle = (tries = 10) => {  // charts have their height only after a while
+    if (place !== null) scrollTo(0, place);
+    if (place !== null && Math.abs(scrollY - place) > 1 && tries) setTimeout(settle, 100, tries - 1);
+    else place = null;
+  };
+  setTimeout(settle, 100);
   const changes = new EventSource(`changes?of=${watched}`);
   changes.onmessage = () => {
     changes.close();
     sessionStorage.setItem("chosen", JSON.stringify(Object.fromEntries(controls().map(([name, node]) => [name, chosen(node)]))));
-    sessionStorage.setItem("scroll", scrollY);
+    sessionStorage.setItem("scroll", place ?? scrollY);
     location.reload();
   };
   changes.onerror = () => {
