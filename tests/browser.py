@@ -60,14 +60,14 @@ class Browser:
     def open(self, page, *, width=1280, height=900, dark=False):
         """Open a file or an address, and wait until it is drawn."""
         self.send("Page.navigate", url="about:blank")  # so that no page before it asks for anything more
-        _wait(lambda: {True: True}[self.run("location.href === 'about:blank'")])
+        self.until("location.href === 'about:blank'", seconds=20.0)
         self.problems, self.requests = [], []
         phone = width < 600
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
         scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
         self.send("Emulation.setEmulatedMedia", features=scheme)
         self.send("Page.navigate", url=page if isinstance(page, str) else page.absolute().as_uri())
-        _wait(lambda: {True: True}[self.run("document.readyState === 'complete' && !!document.querySelector('svg')")])
+        self.until("document.readyState === 'complete' && document.querySelector('svg')", seconds=20.0)
         self.run("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))")
 
     def run(self, script):
@@ -75,6 +75,13 @@ class Browser:
         found = self.send("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
+
+    def until(self, condition, *, seconds=60.0):
+        """Wait until a JavaScript expression is true."""
+        end = time.monotonic() + seconds
+        while not self.run(f"!!({condition})"):
+            assert time.monotonic() < end, condition
+            time.sleep(0.05)
 
     def screenshot(self, path):
         """The whole page as a picture."""

@@ -73,6 +73,13 @@ MENDS = (
         "        if False:",
     ),
     Mend(
+        "the page of star watch loses its place when the run writes twice within a moment",
+        "tests/report/test_watching.py::test_in_a_browser_it_renews_itself_and_keeps_what_was_chosen",
+        "star/assets/report.js",
+        "place ?? scrollY",
+        "scrollY",
+    ),
+    Mend(
         "Q-learning learns nothing from periods that the task ended",
         "tests/agent/test_commander.py::test_q_learning_averages_the_errors_of_each_cell",
         "star/agent/q_learning.py",

@@ -631,11 +631,11 @@ function watch() {
   document.documentElement.style.overflowAnchor = "none";
   let place = sessionStorage.getItem("scroll");  // null once the page stands there
   const settle = (tries = 10) => {  // charts have their height only after a while
-    if (place !== null) scrollTo(0, place);
-    if (place !== null && Math.abs(scrollY - place) > 1 && tries) setTimeout(settle, 100, tries - 1);
+    scrollTo(0, place);
+    if (Math.abs(scrollY - place) > 1 && tries) setTimeout(settle, 100, tries - 1);
     else place = null;
   };
-  setTimeout(settle, 100);
+  if (place !== null) setTimeout(settle, 100);
   const changes = new EventSource(`changes?of=${watched}`);
   changes.onmessage = () => {
     changes.close();

@@ -142,9 +142,9 @@ def test_in_a_browser_it_renews_itself_and_keeps_what_was_chosen(browser, make, 
     with served(run_dir) as page:
         browser.send("Emulation.setDeviceMetricsOverride", width=800, height=400, deviceScaleFactor=1, mobile=False)
         browser.send("Page.navigate", url=f"http://localhost:{page.port}/")
-        until(browser, "document.body?.textContent.includes('as soon as it is complete')")
+        browser.until("document.body?.textContent.includes('as soon as it is complete')")
         lines(run_dir / "metrics.jsonl", metrics(2, (0, 1)))
-        until(browser, "!!document.querySelector('#evaluations svg')")
+        browser.until("document.querySelector('#evaluations svg')")
         browser.run("document.querySelector('#evaluations input[value=wall_s]').click()")
         browser.run("document.querySelector('#provenance').scrollIntoView()")
         place = browser.run("scrollY")
@@ -153,18 +153,11 @@ def test_in_a_browser_it_renews_itself_and_keeps_what_was_chosen(browser, make, 
             lines(run_dir / "metrics.jsonl", metrics(4, (0, 1)))
             time.sleep(0.04)
         last = version(get(page.port, "/")[1])
-        until(browser, f"document.querySelector('table.runs') && watched === '{last}'")
+        browser.until(f"document.querySelector('table.runs') && watched === '{last}'")
         assert "200 of 400" not in browser.run(row)
         assert browser.run("document.querySelector('#evaluations input[value=wall_s]').checked")
         assert "wall-clock, s" in browser.run("document.querySelector('#evaluations svg').textContent")
-        until(browser, f"Math.abs(scrollY - {place}) < 50")
+        browser.until(f"Math.abs(scrollY - {place}) < 50")
         assert place > 100 and browser.problems == []
-    until(browser, "!document.querySelector('#live')")
+    browser.until("!document.querySelector('#live')")
     assert "400" in browser.run(row) and browser.problems == []
-
-
-def until(browser, condition):
-    end = time.monotonic() + 60
-    while not browser.run(condition):
-        assert time.monotonic() < end, condition
-        time.sleep(0.1)
