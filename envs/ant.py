@@ -44,6 +44,9 @@ BENT = (0.55, (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0))  # JaxGCRL's start: th
 LEGS = ((1, 1), (-1, 1), (-1, -1), (1, -1))  # which way along x and y each points
 FOOT = 0.08  # radius of JaxGCRL's feet, m
 MUJOCO_SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
+SPRING_SOLIMP = (0.01, 0.01, 0.001, 0.5, 2.0)  # limits that yield; see _as_in_spring
+SPRING_DAMPING = 10.0  # N m s/rad
+SPRING_STIFFNESS = 1000.0  # N m/rad
 ON_ITS_BACK = -0.5  # the ant is flipped when the vertical part of its own up axis is below
 LIFT = 2 * HEIGHT  # how far an open gate is lifted, m
 
@@ -61,8 +64,8 @@ def spec(*, action_scale: float = 1.0, collisions: str = "all", model: str = "pu
 
     `model="jaxgcrl"` has feet, which touch the floor, walls, torso and each other; torso and hips touch walls and feet
     alone. Contacts have MuJoCo's own parameters, and joints are not damped implicitly. `model="jaxgcrl_spring"` is the
-    same with the masses that Brax's engine `spring` takes. `model="gymnasium"` has MuJoCo's parameters of contacts and
-    all else as published.
+    same with the masses and hinges of Brax's engine `spring`. `model="gymnasium"` has MuJoCo's parameters of contacts,
+    and all else as published.
     """
     xml = resources.files("envs").joinpath("assets", "ant.xml").read_text(encoding="utf-8")
     ant = mujoco.MjSpec.from_string(xml)
@@ -77,7 +80,7 @@ def spec(*, action_scale: float = 1.0, collisions: str = "all", model: str = "pu
     if model in JAXGCRL:
         _as_in_jaxgcrl(ant)
     if model == "jaxgcrl_spring":
-        _weighed_by_spring(ant)
+        _as_in_spring(ant)
     return ant
 
 
@@ -99,16 +102,27 @@ def _as_in_jaxgcrl(ant: mujoco.MjSpec) -> None:
         )
 
 
-def _weighed_by_spring(ant: mujoco.MjSpec) -> None:
-    """Give each link 1 kg, and 1 kg m^2 about every axis.
+def _as_in_spring(ant: mujoco.MjSpec) -> None:
+    """Give links and hinges what Brax's engine `spring` makes of JaxGCRL's model.
 
-    Brax's `spring` raises masses and inertias to the power of 1 minus a scale, and JaxGCRL's model has 1 for both.
+    Each link has 1 kg, and 1 kg m^2 about every axis: `spring` raises masses and inertias to the power of 1 minus a
+    scale, and the model has 1 for both. Hinges have no armature, the model's `constraint_ang_damping`, and limits that
+    are springs of its `constraint_limit_stiffness`. With an impedance near 0 MuJoCo's limit is a spring, too, whose
+    `solref_limit` is minus the acceleration for each rad.
     """
     weighed = ant.copy().compile()
     ant.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     for body in ant.bodies[1:]:
         body.explicitinertial, body.mass, body.inertia = True, 1.0, np.ones(3)
         body.ipos, body.iquat = weighed.body(body.name).ipos, [1.0, 0.0, 0.0, 0.0]
+    hinges = [joint for joint in ant.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
+    for hinge in hinges:
+        hinge.armature, hinge.damping = 0.0, np.array([[SPRING_DAMPING], [0.0], [0.0]])
+    weighed = ant.copy().compile()
+    for hinge in hinges:
+        ease = weighed.dof_invweight0[weighed.joint(hinge.name).dofadr[0]]  # rad/s^2 for each N m
+        hinge.solref_limit = [-SPRING_STIFFNESS * ease, 0.0]
+        hinge.solimp_limit = SPRING_SOLIMP
 
 
 def soles(qpos: jax.Array) -> jax.Array:

@@ -34,8 +34,8 @@ _JAXGCRL: Mapping[str, Any] = {
 }
 # `fast` is accurate enough to learn on and several times cheaper; `published` is the paper's integrator with
 # MuJoCo's own limits on the solver. All 13 geoms of the ant collide with floor and walls in both. `jaxgcrl` is the
-# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025), `jaxgcrl_spring` has the masses of its `spring` and
-# begins on the floor.
+# ant of JaxGCRL on its backend `mjx` (Bortkiewicz et al. 2025), `jaxgcrl_spring` has the masses and hinges of
+# its `spring` and begins on the floor.
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "fast": {"integrator": "implicitfast", "iterations": 10, "ls_iterations": 10},
     "published": {"integrator": "rk4", "iterations": 100, "ls_iterations": 50},

@@ -112,7 +112,7 @@ def trained(
     settings = {**tuning["configurations"][name], **tuning["settings"], "trainer.total_env_steps": one["env_steps"]}
     program = {"stage": stage, "configuration": name, "seeds": one["seeds"]}
     try:
-        found = measure(tuning["task"], tuning["agent"], one["seeds"], options, words(settings), goals="train")
+        found = measure(tuning["task"], tuning["agent"], one["seeds"], options, words(settings), goals=("train",))
     except subprocess.CalledProcessError as error:
         if error.returncode == NOT_FINITE:
             return program | {"score": 0.0, "broke": "not finite", "command": shlex.join(map(str, error.cmd))}

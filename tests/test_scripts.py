@@ -136,7 +136,10 @@ def test_lives_are_counted_until_the_first_end_and_by_its_reason(monkeypatch):
     monkeypatch.setattr(script, "STEPS", 10)
 
     def at(height, place):
-        obs, over = jnp.asarray([0.0, place, height]), (height < 0.2) | (height > 1)
+        pose = (
+            jnp.zeros(15).at[1:3].set(jnp.asarray([place, height])).at[9].set(-place)
+        )  # its second hip turns as it goes
+        obs, over = jnp.concatenate([pose, jnp.full(14, 2.0)]), (height < 0.2) | (height > 1)
         return State(None, obs, jnp.zeros(()), jnp.float32(over), {})
 
     climber = argparse.Namespace(
@@ -146,7 +149,8 @@ def test_lives_are_counted_until_the_first_end_and_by_its_reason(monkeypatch):
     )
     found = script.lives(climber, lambda obs, key: jnp.asarray([0.2, -0.2, 0.0]))  # 1.1 m in step 3, .1 m in step 2
     speed = (3 * 0.2 + 2 * 0.2) / (3 + 2 + 10) / 0.05
-    assert found == {"env_steps": 3 + 2 + 10, "ends": 2, "high": 1, "speed": round(speed, 3)}
+    counts = {"env_steps": 3 + 2 + 10, "ends": 2, "high": 1}
+    assert found == counts | {"speed": round(speed, 3), "hinges": 2.0, "hip": 0.6}
 
 
 def test_the_last_layer_of_our_actor_is_two_of_jaxgcrls():
@@ -258,9 +262,9 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
             (folder / "provenance.jsonl").write_text(json.dumps(start) + "\n", encoding="utf-8")
             return None
         seeds = [json.loads(line)["seed"] for line in (Path(rest[0]) / "metrics.jsonl").read_text().splitlines()]
-        report = {
-            "seeds": [{"seed": seed, "episodes": 200, "success_any": 1.0, "success_final": seed / 4} for seed in seeds]
-        }
+        success = {"test": 1.0, "train": 0.8}[rest[rest.index("--goals") + 1]]
+        one = {"episodes": 200, "success_any": success}
+        report = {"seeds": [one | {"seed": seed, "success_final": seed / 4} for seed in seeds]}
         return argparse.Namespace(stdout=json.dumps(report) + "\n")
 
     monkeypatch.setattr(script.subprocess, "run", run)
@@ -281,6 +285,10 @@ def test_seeds_that_are_there_already_are_not_trained_again(tmp_path, monkeypatc
     assert {program["digest"]["settings"] for program in kept["runs"]} == {"a1"}
     script.main(["point_maze", "star", "--seeds", "1", "--out", str(tmp_path / "c"), *common, "--", "--seed", "7"])
     assert trained[-1] == [0] and len(list((tmp_path / "runs" / "point_maze").glob("star-0-*"))) == 3
+    script.main(["point_maze", "star", "--goals", "test", "train", "--out", str(tmp_path / "d"), *common])
+    both = json.loads((tmp_path / "d" / "star.json").read_text(encoding="utf-8"))["seeds"]
+    assert [seed["success_any"] for seed in both] == [1.0] * 5
+    assert [(seed["train"]["seed"], seed["train"]["success_any"]) for seed in both] == [(i, 0.8) for i in range(5)]
     assert "| star | 5 | 0.5 k | 1.000 [0.996, 1.000] | 0.500 [" in (tmp_path / "a" / "table.md").read_text()
     (tmp_path / "a" / "star.json").unlink()
     (tmp_path / "a" / "notes.json").write_text("not a report", encoding="utf-8")
@@ -326,7 +334,7 @@ def tuned(tmp_path, monkeypatch):
 
     def measure(task, name, seeds, options, given, *, goals):
         *own, key, steps = given
-        assert (task, name, goals, key) == ("point_maze", "hiro", "train", "--trainer.total_env_steps")
+        assert (task, name, goals, key) == ("point_maze", "hiro", ("train",), "--trainer.total_env_steps")
         (chosen,) = [one for one, words in settings.items() if words == own]
         asked.append((chosen, tuple(seeds), int(steps)))
         if len(asked) == fails_at:

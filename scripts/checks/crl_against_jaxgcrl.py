@@ -16,6 +16,8 @@ in [-1, 1] or those of the `initial` actor, which has not learnt:
     ends       episodes that have ended by then
     high       those of them that have ended above 1 m; the others are below .2 m
     speed      m/s along the ground, mean over these env steps
+    hinges     rad/s of the hinges, root of the mean square over these env steps
+    hip        rad from its middle that no hip went beyond; its limit is .52
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from flax import struct
 from flax.training.train_state import TrainState
 
 import envs
-from envs.ant import HEALTHY
+from envs.ant import HEALTHY, QPOS, QVEL
 from envs.options import JAXGCRL
 from scripts.checks.against_jaxgcrl import loaded, theirs
 from star.learners import crl
@@ -48,7 +50,7 @@ from star.learners.sections import CRLConfig
 STATE, ACTION, GOAL, BATCHES = 29, 8, 2, 10
 LEAP = 1e6  # step size from which a gradient is told without loss of digits
 ENVS, STEPS = 32, 300
-HEIGHT = 2  # index of an observation
+HEIGHT, HIPS, TURNING = 2, slice(7, QPOS, 2), slice(QPOS + 6, QPOS + QVEL)  # in an observation
 
 
 class Parts(struct.PyTreeNode):
@@ -154,16 +156,21 @@ def lives(env: Any, actions: Callable[[jax.Array, jax.Array], jax.Array]) -> dic
         before, state = state, jax.vmap(env.step)(state, actions(state.obs, key))
         height, over = state.obs[:, HEIGHT], alive & (state.done > 0)
         way = alive * jnp.linalg.norm(state.obs[:, :2] - before.obs[:, :2], axis=-1)
-        return (state, alive & ~over), (alive, over, over & (height > HEALTHY[1]), way)
+        turning = alive * jnp.square(state.obs[:, TURNING]).mean(axis=-1)
+        hip = (alive[:, None] * jnp.abs(state.obs[:, HIPS])).max()
+        return (state, alive & ~over), ((alive, over, over & (height > HEALTHY[1]), way, turning), hip)
 
     @jax.jit
     def run(key: jax.Array) -> Any:
         start = jax.vmap(env.reset)(jax.random.split(key, ENVS))
         return jax.lax.scan(step, (start, jnp.ones(ENVS, bool)), jax.random.split(key, STEPS))[1]
 
-    *counts, way = map(jnp.sum, run(jax.random.key(0, impl="threefry2x32")))
-    told = dict(zip(("env_steps", "ends", "high"), map(int, counts), strict=True))
-    return told | {"speed": round(float(way / env.dt) / told["env_steps"], 3)}
+    sums, hip = run(jax.random.key(0, impl="threefry2x32"))
+    *counts, way, turning = map(jnp.sum, sums)
+    told: dict[str, float] = dict(zip(("env_steps", "ends", "high"), map(int, counts), strict=True))
+    told["speed"] = round(float(way / env.dt) / told["env_steps"], 3)
+    told["hinges"] = round(float(turning / told["env_steps"]) ** 0.5, 2)
+    return told | {"hip": round(float(hip.max()), 2)}
 
 
 def rows(clone: Path, backends: list[str], engines: list[str]) -> list[dict[str, Any]]:

@@ -1,7 +1,7 @@
 """Train and evaluate the agents of a results table, and draw their curves.
 
     python scripts/results/reproduce.py TASK [NAME ...] [--seed 0] [--seeds 5] [--level 0.9] [--one-by-one]
-                                         [--out FOLDER] [-- SETTINGS]
+                                         [--goals test train] [--out FOLDER] [-- SETTINGS]
     python scripts/results/reproduce.py ROW [ROW ...] [--runs FOLDER] [--commit NAME]
 
 A ROW is a file of results/ without its ending, such as ant_fall/gara: it is measured anew as its JSON says, with the
@@ -13,10 +13,10 @@ passed on to `star train`. For each name the seeds are trained side by side in o
 after another, which is how wall-clock times to a success are meant to be taken. Into results/TASK, or
 results/TASK/one_by_one, go
 
-    NAME.json     every seed's success on `--episodes` greedy episodes on test goals; env steps to success_any `--level`
-                  (null: never), seconds of training to it, and seconds since the start of the run, with compilation
-                  and evaluations; of every program its seeds, command, commit, device, versions and learning digest
-                  (scripts/results/digest.py)
+    NAME.json     every seed's success on `--episodes` greedy episodes on test goals, and apart on other `--goals`; env
+                  steps to success_any `--level` (null: never), seconds of training to it, and seconds since the start
+                  of the run, with compilation and evaluations; of every program its seeds, command, commit, device,
+                  versions and learning digest (scripts/results/digest.py)
     curves.jsonl  all evaluations during training
     curves.png    success_any over env steps and over wall-clock: mean over seeds, and their range if there are at most
                   five agents; where teachers may be asked also the share of episodes in which they are
@@ -51,8 +51,10 @@ from star.training.journal import Journal, JsonLines
 ROOT = Path(__file__).parents[2]
 LAYERS = ("agents", "ablations", "sgim", "paper")
 AGENTS = ("star", "hiro", "hrac", "gara", "flat", "flat_td3")
+GOALS = ("test", "train")  # sets of goals that a row may be tested with
 LEVEL = 0.9  # of success_any, for the time to it, unless said otherwise
-CURVE = ("seed", "env_steps", "wall_s", "eval/success_any", "eval/success_final", "abstraction/regions")
+MEASURED = ("eval/success_any", "eval/success_final", "eval/time_at_goal", "abstraction/regions")
+CURVE = ("seed", "env_steps", "wall_s", *MEASURED)
 STAR = (sys.executable, "-m", "star")
 
 
@@ -83,12 +85,13 @@ def measure(
     options: argparse.Namespace,
     settings: list[str],
     *,
-    goals: str = "test",
+    goals: Sequence[str] = ("test",),
     version: str = "",
 ) -> dict[str, Any]:
     """Train and evaluate the consecutive `seeds` of one agent in one program: metrics, evaluation, how it was run.
 
-    Runs of another `version` of the agent are kept apart.
+    The evaluation of a seed is that with the first of `goals`; those with the others stand in it by their names. Runs
+    of another `version` of the agent are kept apart.
     """
     apart = shlex.join(settings) + version
     other = [hashlib.sha256(apart.encode()).hexdigest()[:8]] if apart else []
@@ -98,13 +101,21 @@ def measure(
         subprocess.run([*STAR, "train", "--resume", str(run)], cwd=ROOT, check=True)
     else:
         subprocess.run([*STAR, *train, "--run-dir", str(run)], cwd=ROOT, check=True)
-    evaluate = [*STAR, "evaluate", str(run), "--episodes", str(options.episodes), "--goals", goals, "--json"]
-    report = subprocess.run(evaluate, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    evaluated, *others = (_evaluated(run, which, options.episodes) for which in goals)
+    for which, seen in zip(goals[1:], others, strict=True):
+        evaluated = [seed | {which: more} for seed, more in zip(evaluated, seen, strict=True)]
     return {
         "rows": JsonLines(run / "metrics.jsonl").read(),
-        "evaluated": json.loads(report.splitlines()[-1])["seeds"],
+        "evaluated": evaluated,
         "run": {"seeds": seeds, "command": shlex.join(["star", *train])} | provenance(run, options.commit),
     }
+
+
+def _evaluated(run: Path, goals: str, episodes: int) -> list[dict[str, Any]]:
+    """The evaluation of each seed of `run` on a set of `goals`."""
+    evaluate = [*STAR, "evaluate", str(run), "--episodes", str(episodes), "--goals", goals, "--json"]
+    report = subprocess.run(evaluate, cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    return json.loads(report.splitlines()[-1])["seeds"]
 
 
 def summarise(
@@ -246,7 +257,9 @@ def again(row: str, options: Sequence[str] = ()) -> list[str]:
     alone = ["--one-by-one"] * all(len(run["seeds"]) == 1 for run in runs)
     level = ["--level", str(report.get("level", LEVEL)), "--episodes", str(report["seeds"][0]["episodes"])]
     which = ["--seed", str(seeds[0]), "--seeds", str(len(seeds)), "--out", str(path.parent)]
-    return [report["task"], report["name"], *which, *level, *alone, *options, "--", *settings]
+    others = [goals for goals in GOALS[1:] if goals in report["seeds"][0]]
+    tested = ["--goals", GOALS[0], *others] if others else []
+    return [report["task"], report["name"], *which, *level, *tested, *alone, *options, "--", *settings]
 
 
 def _told_by_us(words: list[str], place: int) -> bool:
@@ -277,6 +290,7 @@ def fill(given: list[str]) -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--level", type=float, default=LEVEL, help="of success_any, for the time to it")
+    parser.add_argument("--goals", nargs="+", choices=GOALS, default=GOALS[:1], help="sets of goals to test with")
     parser.add_argument("--one-by-one", action="store_true")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--commit", help="what to record where there is no git")
@@ -305,7 +319,9 @@ def fill(given: list[str]) -> None:
         wanted = range(options.seed, options.seed + options.seeds)
         missing = sorted(set(wanted) - {seed["seed"] for seed in report.get("seeds", [])})
         for seeds in groups(missing, one_by_one=options.one_by_one):
-            measured = measure(options.task, name, seeds, options, settings, version=json.dumps(today))
+            measured = measure(
+                options.task, name, seeds, options, settings, goals=options.goals, version=json.dumps(today)
+            )
             measured["run"]["digest"] = today
             report, curve = summarise(options.task, name, report, measured, level=options.level)
             there = {seed["seed"] for seed in report["seeds"]} - set(seeds)

@@ -250,8 +250,21 @@ def test_links_weigh_as_much_as_in_spring_and_all_else_is_the_other_preset():
     model = heavy.physics.model
     np.testing.assert_array_equal(model.body_mass[1:], np.ones(9))
     np.testing.assert_array_equal(model.body_inertia[1:], np.ones((9, 3)))
-    for name in ("body_ipos", "geom_size", "geom_pos", "geom_contype", "dof_armature", "dof_damping", "jnt_range"):
+    for name in ("body_ipos", "geom_size", "geom_pos", "geom_contype", "jnt_range", "actuator_gear"):
         np.testing.assert_array_equal(getattr(model, name), getattr(light.physics.model, name))
+
+
+def test_limits_of_the_heavy_ant_are_springs_of_1000_newton_metres_and_its_hinges_are_damped_by_10():
+    model = made("ant_u4_maze", preset="jaxgcrl_spring").body.physics.model
+    np.testing.assert_array_equal(model.dof_armature, np.zeros(14))
+    np.testing.assert_array_equal(model.dof_damping, [0.0] * 6 + [10.0] * 8)
+    data = mujoco.MjData(model)
+    data.qpos[2] = 5.0  # in the air
+    beyond = np.linspace(0.05, 0.4, 8)
+    data.qpos[7:15] = np.where(np.arange(8) % 3, model.jnt_range[1:, 1] + beyond, model.jnt_range[1:, 0] - beyond)
+    mujoco.mj_forward(model, data)
+    signs = np.where(np.arange(8) % 3, -1.0, 1.0)
+    np.testing.assert_allclose(data.qfrc_constraint[6:14], 1000.0 * signs * beyond, rtol=0.05)
 
 
 def test_the_heavy_ant_begins_with_no_foot_in_the_floor_and_else_as_the_other():
