@@ -73,6 +73,13 @@ MENDS = (
         "        if False:",
     ),
     Mend(
+        "the hinges of JaxGCRL's heavy ant stop at their limits, and those of spring yield",
+        "tests/envs/test_tasks.py::test_limits_of_the_heavy_ant_are_springs_of_1000_newton_metres_and_its_hinges_are_damped_by_10",
+        "envs/ant.py",
+        "        hinge.solimp_limit = SPRING_SOLIMP",
+        "        hinge.solimp_limit = MUJOCO_SOLIMP",
+    ),
+    Mend(
         "the page of star watch loses its place when the run writes twice within a moment",
         "tests/report/test_watching.py::test_in_a_browser_it_renews_itself_and_keeps_what_was_chosen",
         "star/assets/report.js",
