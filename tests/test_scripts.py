@@ -136,9 +136,8 @@ def test_lives_are_counted_until_the_first_end_and_by_its_reason(monkeypatch):
     monkeypatch.setattr(script, "STEPS", 10)
 
     def at(height, place):
-        pose = (
-            jnp.zeros(15).at[1:3].set(jnp.asarray([place, height])).at[9].set(-place)
-        )  # its second hip turns as it goes
+        second_hip = -place
+        pose = jnp.zeros(15).at[jnp.array([1, 2, 9])].set(jnp.asarray([place, height, second_hip]))
         obs, over = jnp.concatenate([pose, jnp.full(14, 2.0)]), (height < 0.2) | (height > 1)
         return State(None, obs, jnp.zeros(()), jnp.float32(over), {})
 
