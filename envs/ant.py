@@ -110,17 +110,17 @@ def _as_in_spring(ant: mujoco.MjSpec) -> None:
     are springs of its `constraint_limit_stiffness`. With an impedance near 0 MuJoCo's limit is a spring, too, whose
     `solref_limit` is minus the acceleration for each rad.
     """
-    weighed = ant.copy().compile()
+    light = ant.copy().compile()
     ant.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
     for body in ant.bodies[1:]:
         body.explicitinertial, body.mass, body.inertia = True, 1.0, np.ones(3)
-        body.ipos, body.iquat = weighed.body(body.name).ipos, [1.0, 0.0, 0.0, 0.0]
-    hinges = [joint for joint in ant.joints if joint.type == mujoco.mjtJoint.mjJNT_HINGE]
+        body.ipos, body.iquat = light.body(body.name).ipos, [1.0, 0.0, 0.0, 0.0]
+    hinges = ant.joints[1:]
     for hinge in hinges:
         hinge.armature, hinge.damping = 0.0, np.array([[SPRING_DAMPING], [0.0], [0.0]])
-    weighed = ant.copy().compile()
+    heavy = ant.copy().compile()
     for hinge in hinges:
-        ease = weighed.dof_invweight0[weighed.joint(hinge.name).dofadr[0]]  # rad/s^2 for each N m
+        ease = heavy.dof_invweight0[heavy.joint(hinge.name).dofadr[0]]  # rad/s^2 for each N m
         hinge.solref_limit = [-SPRING_STIFFNESS * ease, 0.0]
         hinge.solimp_limit = SPRING_SOLIMP
 
