@@ -2,13 +2,13 @@
 
     target  <- epsilon-greedy in Q[region, goal region, .] over the successors that reachability allows
 
-    command     where a period begins, after every k env steps: target and box
+    command     where a decision is due, after every k env steps: target and box
     experience  a segment, on which its clock moves on; where a period ends with it, a decision and where that led
     observe     the decisions of an instant, by `planning` or `q_learning`
     follow      once an epoch: the regions may have been cut
 
-Greedy episodes explore nothing, and follow a plan of their own (`settle`). But where an agent stands still (`standing`)
-Tutor and Controller act with noise.
+Greedy episodes explore nothing, and follow a plan of their own (`settle`), in which a decision is also due where the
+agent has come to a better region. But where an agent stands still (`standing`) Tutor and Controller act with noise.
 
 Source: STAR (ICLR 2024), section 4.1.
 """
@@ -19,7 +19,7 @@ from functools import partial
 from types import ModuleType
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from envs.common.batching import where
 from star.abstraction import regions
@@ -96,7 +96,7 @@ def command(
     env_steps: Float[Array, ""] | float | None,
     key: Array,
 ) -> Memory:
-    """The decision of those whose clock is 0; greedy where `env_steps`, those of all environments so far, is None."""
+    """The decisions of those who are due; greedy where `env_steps`, those of all environments so far, is None."""
     locate = partial(regions.locate, roadmap.abstraction)
     region, goal_region = locate(scene.position), locate(scene.goal)
     target = values.choose(
@@ -121,11 +121,33 @@ def command(
         goal_region=goal_region,
         target=target,
         box=target_box(task, roadmap.abstraction, target, around=around, point=aim),
-        start=scene.position,
+        start=jnp.where((memory.clock == 0)[:, None], scene.position, memory.start),
         reward=jnp.full_like(memory.reward, start_reward(section)),
         aside=aside,
     )
-    return where(memory.clock == 0, fresh, memory)
+    return where(_due(section, state, roadmap, memory, region, goal_region, greedy=env_steps is None), fresh, memory)
+
+
+def _due(
+    section: CommanderConfig,
+    state: CommanderState,
+    roadmap: Roadmap,
+    memory: Memory,
+    region: Int[Array, "B"],
+    goal_region: Int[Array, "B"],
+    *,
+    greedy: bool,
+) -> Bool[Array, "B"]:
+    """True where a period begins. With a plan and `greedy` also where the agent has come to a region of higher value.
+
+    In a region that is no better the command holds: who turned back there might walk between two regions for ever.
+    In training it always holds, since what is counted is where whole periods lead.
+    """
+    begins = memory.clock == 0
+    if not greedy or section.learner != "model":
+        return begins
+    value = partial(values.worth, state, roadmap.allowed, goal_region=goal_region)
+    return begins | (value(region) > value(memory.region))
 
 
 def _shares(

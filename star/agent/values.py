@@ -50,8 +50,7 @@ def choose(
     """
     explore_key, random_key, tie_key = jax.random.split(key, 3)
     near = allowed.near.region[region]
-    values = state.q[region, goal_region]
-    best_values = jnp.where(targets(allowed.near, allowed.greedy, region, goal_region), values, -jnp.inf)
+    best_values = _greedy(state, allowed, region, goal_region)
     ties = best_values >= best_values.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best_values.shape), -1.0), axis=-1)
     luck = jax.random.gumbel(random_key, best_values.shape)
@@ -61,6 +60,21 @@ def choose(
     exploring = jax.random.uniform(explore_key, region.shape) < epsilon
     place = jnp.where(exploring, jnp.argmax(anything, axis=-1), greedy)
     return jnp.take_along_axis(near, place[:, None], axis=1)[:, 0]
+
+
+def worth(
+    state: CommanderState, allowed: Successors, region: Int[Array, "B"], goal_region: Int[Array, "B"]
+) -> Float[Array, "B"]:
+    """The value of being in each `region` with a goal in `goal_region`, by greedy choices."""
+    return _greedy(state, allowed, region, goal_region).max(axis=-1)
+
+
+def _greedy(
+    state: CommanderState, allowed: Successors, region: Int[Array, "B"], goal_region: Int[Array, "B"]
+) -> Float[Array, "B S"]:
+    """The values of the regions near each `region`, -inf where they are no greedy targets."""
+    possible = targets(allowed.near, allowed.greedy, region, goal_region)
+    return jnp.where(possible, state.q[region, goal_region], -jnp.inf)
 
 
 def towards(

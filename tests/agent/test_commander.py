@@ -88,6 +88,31 @@ def test_who_has_hardly_moved_within_a_period_stands_still_unless_at_the_goal():
     assert standing.tolist() == [True, False, False, True, False, False]
 
 
+@pytest.mark.parametrize(("learner", "env_steps"), [("model", None), ("model", 0.0), ("q", None)])
+def test_a_greedy_plan_is_asked_again_where_the_agent_has_come_to_a_better_region(learner, env_steps):
+    chosen, spec = settings(learner=learner, epsilon_start=0.0, epsilon_end=0.0), plane()
+    abstraction = regions.create(spec.space, ((3.0, 6.0), ()), max_regions=R)
+    left, middle, right = np.asarray(regions.locate(abstraction, np.float32([[1, 1], [4, 1], [7, 1]]))).tolist()
+    q = np.zeros((R, R, R), np.float32)
+    q[left, right, middle], q[middle, right, right], q[right, right, right] = 0.2, 0.5, 0.9
+    roadmap = known(EVERYTHING).replace(abstraction=abstraction)
+
+    # A period begins; within one the agent is where it was, has come to a better region, or to a worse one.
+    position = np.float32([[1, 1], [1, 2], [4, 1], [1, 3]])
+    began = np.float32([[2, 2]] * 4)
+    memory = commander.begin(began).replace(
+        clock=np.int32([0, 3, 3, 3]), region=np.int32([left, left, left, middle]), target=np.full(4, left, np.int32)
+    )
+    after = jax.jit(partial(commander.command, chosen, Task.of(loading.parse({}), spec)), static_argnames="env_steps")(
+        begun(chosen).replace(q=q), roadmap, memory, Scene(position, np.float32([[8, 1]] * 4), np.zeros(4, np.float32)),
+        Marks(), env_steps=env_steps, key=jax.random.key(0),
+    )  # fmt: skip
+    again = learner == "model" and env_steps is None
+    assert after.target.tolist() == [middle, left, right if again else left, left]
+    assert after.region.tolist() == [left, left, middle if again else left, middle]
+    np.testing.assert_array_equal(after.start, [position[0], *began[1:]])  # it stands still if the period has not moved it
+
+
 def random_batch(seed):
     rng = np.random.default_rng(seed)
     few = lambda: rng.integers(0, 3, N).astype(np.int32)  # noqa: E731  # so that cells are met repeatedly
