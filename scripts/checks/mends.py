@@ -66,6 +66,27 @@ MENDS = (
         "",
     ),
     Mend(
+        "a fast greedy agent runs on by a command of a region that it has left behind",
+        "tests/agent/test_commander.py::test_a_greedy_plan_is_asked_again_where_the_agent_has_come_to_a_better_region",
+        "star/agent/commander.py",
+        "    return begins | (value > best), ",
+        "    return begins, ",
+    ),
+    Mend(
+        "a greedy agent walks in a circle, since it is given the same target wherever it comes back",
+        "tests/agent/test_commander.py::test_who_comes_back_to_a_region_is_given_another_target_there_unless_the_goal_is_in_it",
+        "star/agent/commander.py",
+        "        vain=vain,\n",
+        "",
+    ),
+    Mend(
+        "greedy agents are sent by a cut that nobody has walked with yet, and fall into the gap of Ant Fall",
+        "tests/agent/test_epoch.py::test_cuts_wait_for_the_next_epoch",
+        "star/agent/between_episodes.py",
+        "    return state.replace(upcoming=Upcoming.of(later.replace(commander=planned))), metrics",
+        "    later = later.replace(commander=planned)\n    return later.replace(upcoming=Upcoming.of(later)), metrics",
+    ),
+    Mend(
         "feet of JaxGCRL's ant begin in the floor, and MuJoCo throws it up",
         "tests/envs/test_tasks.py::test_the_heavy_ant_begins_with_no_foot_in_the_floor_and_else_as_the_other",
         "envs/ant.py",

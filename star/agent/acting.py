@@ -237,7 +237,7 @@ def _begin(
     """The state as it acts, its roadmap, the memory at the start, and the keys of all segments."""
     agent, segments = levels.of(config, spec, greedy=True), spec.episode_length // config.tutor.period
     _, keys = hierarchy.segment_keys(key, segments)
-    return *hierarchy.prepare(agent, state), agent.commander.begin(spec.abstract(obs)), keys
+    return *hierarchy.prepare(agent, state), hierarchy.begin(agent, state, spec.abstract(obs)), keys
 
 
 @partial(jax.jit, static_argnames="spec")  # agents of one kind share it

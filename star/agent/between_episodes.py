@@ -20,7 +20,7 @@ from star.abstraction.forward_model import Outcome
 from star.agent import commander
 from star.agent.decisions import Decision, Finished, Roadmap
 from star.agent.sections import AgentConfig
-from star.agent.state import TrainState
+from star.agent.state import TrainState, Upcoming
 from star.agent.values import CommanderState
 from star.learners.replay import weighted_mean
 from star.spec import Spec
@@ -42,7 +42,7 @@ def learn(
     env_steps: Array,
     key: Array,
 ) -> tuple[TrainState, Metrics]:
-    """The state after an epoch with the periods `finished` [N], in today's regions.
+    """The state after an epoch with the periods `finished` [N] in its regions, and its `upcoming` with new cuts.
 
     `known` is the Commander before the epoch, and `env_steps` are those of all environments before it.
     """
@@ -58,21 +58,22 @@ def learn(
     goals = outcome.replace(weight=outcome.weight * decision.at_goal)
     state, more = _learn_where_commands_lead(config, state, decision, outcome, key=train_key)
     metrics |= more
+    later = state
     if config.refinement.enabled:
-        state, more = refine(config, spec, guide, state, goals, known=known, finished=finished, key=refine_key)
+        later, more = refine(config, spec, guide, state, goals, known=known, finished=finished, key=refine_key)
         metrics |= more
-    roadmap = Roadmap.of(section, state.abstraction, state.graph)
-    planned = commander.plan(section, commander.fade(section, state.commander), roadmap)
+    roadmap = Roadmap.of(section, later.abstraction, later.graph)
+    planned = commander.plan(section, commander.fade(section, later.commander), roadmap)
     metrics |= {
         "abstraction/regions": state.abstraction.count,
         "commander/epsilon": commander.epsilon(section, env_steps),
     }
-    return state.replace(commander=planned), metrics
+    return state.replace(upcoming=Upcoming.of(later.replace(commander=planned))), metrics
 
 
 def nothing(config: AgentConfig, spec: Spec, guide: ModuleType, state: TrainState, **_: object) -> tuple:
-    """Without a Commander nobody needs regions: the state as it is, no metrics."""
-    return state, {}
+    """Without a Commander nobody needs regions: the next epoch begins with the state as it is, no metrics."""
+    return state.replace(upcoming=Upcoming.of(state)), {}
 
 
 def refine(

@@ -8,7 +8,8 @@
     follow      once an epoch: the regions may have been cut
 
 Greedy episodes explore nothing, and follow a plan of their own (`settle`), in which a decision is also due where the
-agent has come to a better region. But where an agent stands still (`standing`) Tutor and Controller act with noise.
+agent has come to a better region than ever before, and is another one where it comes back to a region. But where an
+agent stands still (`standing`) Tutor and Controller act with noise.
 
 Source: STAR (ICLR 2024), section 4.1.
 """
@@ -26,7 +27,7 @@ from star.abstraction import regions
 from star.abstraction.forward_model import Outcome
 from star.abstraction.regions import Box, Change, Places
 from star.agent import planning, q_learning, values
-from star.agent.decisions import Decision, Finished, Memory, Roadmap, Scene, target_box
+from star.agent.decisions import Decision, Finished, Journey, Memory, Roadmap, Scene, target_box
 from star.agent.sections import CommanderConfig
 from star.agent.segments import Segment
 from star.agent.task import Task
@@ -84,6 +85,14 @@ def begin(position: Float[Array, "B d"]) -> Memory:
     )
 
 
+def set_out(section: CommanderConfig, memory: Memory, *, capacity: int) -> Memory:
+    """The memory at the start of a greedy episode, in which a planner remembers its way through so many regions."""
+    if section.learner != "model":
+        return memory
+    size = len(memory.clock)
+    return memory.replace(journey=Journey(best=jnp.full(size, -jnp.inf), given=jnp.full((size, capacity), -1)))
+
+
 def command(
     section: CommanderConfig,
     task: Task,
@@ -99,11 +108,13 @@ def command(
     """The decisions of those who are due; greedy where `env_steps`, those of all environments so far, is None."""
     locate = partial(regions.locate, roadmap.abstraction)
     region, goal_region = locate(scene.position), locate(scene.goal)
+    due, journey, vain = _on_the_way(state, roadmap, memory, region, goal_region)
     target = values.choose(
         state,
         roadmap.allowed,
         region,
         goal_region,
+        vain=vain,
         attraction=roadmap.attraction,
         epsilon=_shares(section, env_steps, num_envs=len(region)),
         key=key,
@@ -125,29 +136,31 @@ def command(
         reward=jnp.full_like(memory.reward, start_reward(section)),
         aside=aside,
     )
-    return where(_due(section, state, roadmap, memory, region, goal_region, greedy=env_steps is None), fresh, memory)
+    if journey is not None:
+        given = journey.given.at[jnp.arange(len(region)), region].set(target)
+        journey = journey.replace(given=jnp.where(due[:, None], given, journey.given))
+    return where(due, fresh.replace(journey=None), memory.replace(journey=None)).replace(journey=journey)
 
 
-def _due(
-    section: CommanderConfig,
-    state: CommanderState,
-    roadmap: Roadmap,
-    memory: Memory,
-    region: Int[Array, "B"],
-    goal_region: Int[Array, "B"],
-    *,
-    greedy: bool,
-) -> Bool[Array, "B"]:
-    """True where a period begins. With a plan and `greedy` also where the agent has come to a region of higher value.
+def _on_the_way(
+    state: CommanderState, roadmap: Roadmap, memory: Memory, region: Int[Array, "B"], goal_region: Int[Array, "B"]
+) -> tuple[Bool[Array, "B"], Journey | None, Int[Array, "B"] | None]:
+    """Who is due for a decision; each one's journey, and the target that was given in vain where it is now, or -1.
 
-    In a region that is no better the command holds: who turned back there might walk between two regions for ever.
-    In training it always holds, since what is counted is where whole periods lead.
+    A decision is due where a period begins. On a journey it also is where the agent comes to a better region than ever
+    before: so there are no more such decisions than regions. Who comes back to a region was given a target there in
+    vain, and would be led around in a circle by it. In training there is no journey: what is counted is where whole
+    periods lead, and random targets end circles.
     """
-    begins = memory.clock == 0
-    if not greedy or section.learner != "model":
-        return begins
-    value = partial(values.worth, state, roadmap.allowed, goal_region=goal_region)
-    return begins | (value(region) > value(memory.region))
+    begins, journey = memory.clock == 0, memory.journey
+    if journey is None:
+        return begins, None, None
+    value = values.worth(state, roadmap.allowed, region, goal_region)
+    same = goal_region == memory.goal_region
+    best, given = jnp.where(same, journey.best, -jnp.inf), jnp.where(same[:, None], journey.given, -1)
+    back = (region != memory.region) & (region != goal_region)
+    vain = jnp.where(back, given[jnp.arange(len(region)), region], -1)
+    return begins | (value > best), Journey(best=jnp.maximum(best, value), given=given), vain
 
 
 def _shares(

@@ -20,6 +20,15 @@ from star.agent.sections import CommanderConfig
 from star.agent.task import Task
 
 
+class Journey(struct.PyTreeNode):
+    """The ways of B agents towards their goals."""
+
+    best: Float[Array, "B"]
+    """The highest value of a region that each has come to."""
+    given: Int[Array, "B R"]
+    """The target that each was given last in each region, -1 where it was given none."""
+
+
 class Memory(struct.PyTreeNode):
     """State of each of the B environments in its Commander period."""
 
@@ -34,6 +43,8 @@ class Memory(struct.PyTreeNode):
     reward: Float[Array, "B"]
     aside: Bool[Array, "B"]
     """True if the box is that around a waypoint, not the target region or the goal's."""
+    journey: Journey | None = None
+    """The way so far, in greedy episodes of a planner."""
 
 
 class Decision(struct.PyTreeNode):

@@ -51,7 +51,7 @@ def epoch(
     config: AgentConfig, spec: Spec, env: VectorEnv, state: TrainState, teachers: Sequence[Demonstrations] = ()
 ) -> tuple[TrainState, Metrics]:
     """One episode of all environments, its updates, one refinement. `teachers` are those of `config.sgim.teachers`."""
-    agent = levels.of(config, spec)
+    agent, state = levels.of(config, spec), state.renewed()
     guide = agent.guide
     key, reset_key, scan_key, end_key, lesson_key = jax.random.split(state.key, 5)
     env_steps = state.epoch.astype(jnp.float32) * (spec.episode_length * env.num_envs)

@@ -15,7 +15,7 @@ from star.agent.sections import CommanderConfig
 from star.agent.segments import Segment
 from star.agent.task import Task
 
-__all__ = ["begin", "command", "experience", "init", "observe", "renewed", "settle", "standing", "tick"]
+__all__ = ["begin", "command", "experience", "init", "observe", "renewed", "set_out", "settle", "standing", "tick"]
 
 
 def command(
@@ -33,6 +33,11 @@ def command(
     everywhere = jnp.ones(len(region), bool)
     box = target_box(task, roadmap.abstraction, region, around=everywhere, point=scene.goal)
     return where(memory.clock == 0, memory.replace(goal_region=region, target=region, box=box), memory)
+
+
+def set_out(section: CommanderConfig, memory: Memory, **_: Any) -> Memory:
+    """Nothing is remembered of the way."""
+    return memory
 
 
 def experience(

@@ -1,6 +1,7 @@
 """One env step of the hierarchy, whoever moves the body: `play` in simulated environments, `acting` from observations.
 
 prepare   before a greedy episode: the Commander as it acts there, and its roadmap
+begin     a greedy episode: the Commander's memory
 decide    every l env steps: the Commander's target where a period begins, the Tutor's subgoal, and who explores
 follow    after every env step: the subgoal moves with the agent
 act       at every env step: the Controller, which may decide for some env steps at once
@@ -30,6 +31,12 @@ def prepare(agent: Agent, state: TrainState) -> tuple[TrainState, Roadmap]:
     roadmap = Roadmap.of(section, state.abstraction, state.graph)
     settled = agent.commander.settle(section, state.commander, roadmap, episode_length=length)
     return state.replace(commander=settled), roadmap
+
+
+def begin(agent: Agent, state: TrainState, position: Float[Array, "B d"]) -> Memory:
+    """The Commander's memory at the start of a greedy episode, of agents at `position`."""
+    commander = agent.commander
+    return commander.set_out(agent.config.commander, commander.begin(position), capacity=state.abstraction.capacity)
 
 
 def segment_keys(key: Array, segments: int) -> tuple[Array, Array]:

@@ -35,7 +35,7 @@ STAR = Kind(
     tables="regions",
     row={"lower": list, "upper": list, "chosen": list},
     # not known yet; what the environment has repaired
-    may_be_nan=("graph/error", "sgim/mean", "env/non_finite"),
+    may_be_nan=("graph/error", "sgim/mean", "upcoming/graph/error", "upcoming/sgim/mean", "env/non_finite"),
     notices=Notices(notices.KEYS, notices.notices),
     levels={
         "commander": ("commander/reward", None, "commander/td_error"),

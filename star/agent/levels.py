@@ -13,7 +13,7 @@ from jaxtyping import Array
 from star.abstraction import forward_model, refinement, regions
 from star.agent import adjacency, between_episodes, commander, controller, goal_only, passing, tutor
 from star.agent.sections import AgentConfig
-from star.agent.state import TrainState
+from star.agent.state import TrainState, Upcoming
 from star.agent.task import Task, first_cuts
 from star.sgim import lessons, unguided
 from star.spec import Spec
@@ -54,15 +54,19 @@ def init(config: AgentConfig, spec: Spec, *, key: Array) -> TrainState:
     tutor_key, controller_key, model_key, adjacency_key, key = jax.random.split(key, 5)
     agent = of(config, spec)
     abstraction = regions.create(spec.space, first_cuts(config, spec), max_regions=config.abstraction.max_regions)
+    graph = refinement.init(capacity=abstraction.capacity, dimensions=abstraction.lower.shape[-1])
+    table = agent.commander.init(config.commander, regions=abstraction.capacity)
+    sgim = agent.guide.init(config.sgim, abstraction)
     return TrainState(
-        commander=agent.commander.init(config.commander, regions=abstraction.capacity),
+        commander=table,
         tutor=agent.tutor.init(tutor_key, config.tutor, agent.task),
         adjacency=adjacency.init(adjacency_key, config.tutor.adjacency, spec.space),
         controller=controller.init(controller_key, config.controller, agent.task),
         abstraction=abstraction,
-        graph=refinement.init(capacity=abstraction.capacity, dimensions=abstraction.lower.shape[-1]),
+        graph=graph,
         forward_model=forward_model.init(model_key, config.forward_model, space=abstraction.space),
-        sgim=agent.guide.init(config.sgim, abstraction),
+        sgim=sgim,
+        upcoming=Upcoming(commander=table, abstraction=abstraction, graph=graph, sgim=sgim),
         epoch=jnp.zeros((), jnp.int32),
         key=key,
     )

@@ -14,7 +14,7 @@ from star.abstraction.passages import PLANES, Tries
 from star.config.kinds import Arrays, Migration
 from star.learners.sections import TD3Config
 
-FORMAT = 8  # since tries of goals within a region are counted over epochs
+FORMAT = 9  # since greedy episodes see the regions that the last epoch was played in
 
 
 def _count_for_both_aims(arrays: Arrays) -> Arrays:
@@ -71,6 +71,12 @@ def _nothing_tried(arrays: Arrays) -> Arrays:
     return arrays | {f"graph/tries/{count.name}": none for count in dataclasses.fields(Tries)}
 
 
+def _cuts_at_once(arrays: Arrays) -> Arrays:
+    """Cuts were seen at once by greedy episodes too: what is upcoming has come."""
+    parts = ("commander", "abstraction", "graph", "sgim")
+    return arrays | {f"upcoming/{name}": x for name, x in arrays.items() if name.partition("/")[0] in parts}
+
+
 TO_NEXT: Mapping[int, Migration] = {
     2: Migration(),  # the same, in other files and without checksums
     3: Migration(arrays=_count_for_both_aims),
@@ -78,4 +84,5 @@ TO_NEXT: Mapping[int, Migration] = {
     5: Migration(arrays=_observations_as_they_are),
     6: Migration(arrays=_no_values_of_practice),
     7: Migration(arrays=_nothing_tried),
+    8: Migration(arrays=_cuts_at_once),
 }

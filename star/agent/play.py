@@ -107,6 +107,7 @@ def greedy(
     segments = spec.episode_length // config.tutor.period
     reset_key, keys = hierarchy.segment_keys(key, segments)
     streams = start(agent, env, goals=goals, key=reset_key)
+    streams = streams.replace(memory=hierarchy.begin(agent, state, spec.abstract(streams.env.obs)))
     state, roadmap = hierarchy.prepare(agent, state)
 
     def one(streams: Streams, keys: Array) -> tuple[Streams, Any]:

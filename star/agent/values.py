@@ -41,16 +41,21 @@ def choose(
     goal_region: Int[Array, "B"],
     *,
     attraction: Float[Array, "R"] | None = None,
+    vain: Int[Array, "B"] | None = None,
     epsilon: Float[Array, "B"] | float,
     key: Array,
 ) -> Int[Array, "B"]:
     """Target regions: with probability `epsilon` any allowed one, else the best, ties broken at random.
 
-    Random ones are drawn evenly, or in proportion to `attraction`.
+    Random ones are drawn evenly, or in proportion to `attraction`. A target in `vain` (-1: none) is not the best one if
+    there is another.
     """
     explore_key, random_key, tie_key = jax.random.split(key, 3)
     near = allowed.near.region[region]
     best_values = _greedy(state, allowed, region, goal_region)
+    if vain is not None:
+        others = jnp.where(near == vain[:, None], -jnp.inf, best_values)
+        best_values = jnp.where(others.max(axis=-1, keepdims=True) > -jnp.inf, others, best_values)
     ties = best_values >= best_values.max(axis=-1, keepdims=True)
     greedy = jnp.argmax(jnp.where(ties, jax.random.uniform(tie_key, best_values.shape), -1.0), axis=-1)
     luck = jax.random.gumbel(random_key, best_values.shape)

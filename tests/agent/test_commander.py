@@ -88,29 +88,67 @@ def test_who_has_hardly_moved_within_a_period_stands_still_unless_at_the_goal():
     assert standing.tolist() == [True, False, False, True, False, False]
 
 
-@pytest.mark.parametrize(("learner", "env_steps"), [("model", None), ("model", 0.0), ("q", None)])
-def test_a_greedy_plan_is_asked_again_where_the_agent_has_come_to_a_better_region(learner, env_steps):
-    chosen, spec = settings(learner=learner, epsilon_start=0.0, epsilon_end=0.0), plane()
+@pytest.fixture(scope="module")
+def in_a_row():
+    """Three regions in a row, a table in which each leads to the next one and on to the goal, and commands by it."""
+    spec = plane()
     abstraction = regions.create(spec.space, ((3.0, 6.0), ()), max_regions=R)
-    left, middle, right = np.asarray(regions.locate(abstraction, np.float32([[1, 1], [4, 1], [7, 1]]))).tolist()
+    row = left, middle, right = np.asarray(regions.locate(abstraction, np.float32([[1, 1], [4, 1], [7, 1]]))).tolist()
     q = np.zeros((R, R, R), np.float32)
     q[left, right, middle], q[middle, right, right], q[right, right, right] = 0.2, 0.5, 0.9
     roadmap = known(EVERYTHING).replace(abstraction=abstraction)
 
-    # A period begins; within one the agent is where it was, has come to a better region, or to a worse one.
-    position = np.float32([[1, 1], [1, 2], [4, 1], [1, 3]])
-    began = np.float32([[2, 2]] * 4)
-    memory = commander.begin(began).replace(
-        clock=np.int32([0, 3, 3, 3]), region=np.int32([left, left, left, middle]), target=np.full(4, left, np.int32)
-    )
-    after = jax.jit(partial(commander.command, chosen, Task.of(loading.parse({}), spec)), static_argnames="env_steps")(
-        begun(chosen).replace(q=q), roadmap, memory, Scene(position, np.float32([[8, 1]] * 4), np.zeros(4, np.float32)),
-        Marks(), env_steps=env_steps, key=jax.random.key(0),
+    def commanded(position, *, learner="model", greedy=True, best=None, given=None, **memory):
+        """The memory after commands at `position`, by agents who began their last decision as `memory` says."""
+        chosen, n = settings(learner=learner, epsilon_start=0.0, epsilon_end=0.0), len(position)
+        parts = {name: np.int32(x) for name, x in ({"goal_region": [right] * n} | memory).items()}
+        before = commander.begin(np.full((n, 2), 2.0, np.float32)).replace(**parts)
+        if greedy:
+            before = commander.set_out(chosen, before, capacity=R)
+        if before.journey is not None:
+            journey = before.journey.replace(best=np.float32(best))
+            before = before.replace(journey=journey if given is None else journey.replace(given=np.int32(given)))
+        task, state = Task.of(loading.parse({}), spec), begun(chosen).replace(q=q)
+        scene = Scene(np.float32(position), np.float32([[8, 1]] * n), np.zeros(n, np.float32))
+        command = jax.jit(partial(commander.command, chosen, task), static_argnames="env_steps")
+        env_steps = None if greedy else 0.0
+        return command(state, roadmap, before, scene, Marks(), env_steps=env_steps, key=jax.random.key(0))
+
+    return row, commanded
+
+
+@pytest.mark.parametrize(("learner", "greedy"), [("model", True), ("model", False), ("q", True)])
+def test_a_greedy_plan_is_asked_again_where_the_agent_has_come_to_a_better_region(in_a_row, learner, greedy):
+    (left, middle, right), commanded = in_a_row
+    # A period begins; in one the agent is where it was, has come to a better region, a worse one, or back to the best.
+    position = [[1, 1], [1, 2], [4, 1], [1, 3], [4, 2]]
+    after = commanded(
+        position, learner=learner, greedy=greedy, best=[-np.inf, 0.2, 0.2, 0.5, 0.5],
+        clock=[0, 3, 3, 3, 3], region=[left, left, left, middle, left], target=[left] * 5,
     )  # fmt: skip
-    again = learner == "model" and env_steps is None
-    assert after.target.tolist() == [middle, left, right if again else left, left]
-    assert after.region.tolist() == [left, left, middle if again else left, middle]
-    np.testing.assert_array_equal(after.start, [position[0], *began[1:]])  # it stands still if the period has not moved it
+    again = learner == "model" and greedy
+    assert after.target.tolist() == [middle, left, right if again else left, left, left]
+    assert after.region.tolist() == [left, left, middle if again else left, middle, left]
+    np.testing.assert_array_equal(after.start, [position[0]] + [[2, 2]] * 4)  # who stands still is told by the period
+    assert (after.journey is not None) == again
+    if again:
+        np.testing.assert_allclose(after.journey.best, [0.2, 0.2, 0.5, 0.5, 0.5])
+        assert after.journey.given[:, left].tolist() == [middle, -1, -1, -1, -1]
+        assert after.journey.given[:, middle].tolist() == [-1, -1, right, -1, -1]
+
+
+def test_who_comes_back_to_a_region_is_given_another_target_there_unless_the_goal_is_in_it(in_a_row):
+    (left, middle, right), commanded = in_a_row
+    given = np.full((4, R), -1)
+    given[:, left], given[3, right] = middle, right
+    # Back from the middle; still there; back, but with another goal; and back where the goal is.
+    after = commanded(
+        [[1, 1], [1, 1], [1, 1], [7, 1]], best=[0.9] * 4, given=given, clock=[0] * 4, target=[left] * 4,
+        region=[middle, left, middle, middle], goal_region=[right, right, left, right],
+    )  # fmt: skip
+    assert int(after.target[0]) != middle
+    assert after.target[1:].tolist() == [middle, middle, right]
+    assert after.journey.given[0, left] == after.target[0]
 
 
 def random_batch(seed):

@@ -284,6 +284,39 @@ def test_periods_beyond_the_room_of_the_buffer_count_for_refinement_too(tiny):
     np.testing.assert_array_equal(kept.start, point[:8])
 
 
+def test_cuts_wait_for_the_next_epoch(tiny, fresh, breaking_env, monkeypatch):
+    """Greedy episodes in between see the regions that were played in, and what was counted there."""
+    section = tiny["abstraction"] | {"max_regions": 17}
+    config, state = loading.parse({**tiny, "abstraction": section}).hyper(), fresh(abstraction=section)
+    middle = regions.Cut(jnp.int32(0), jnp.int32(0), (state.abstraction.lower + state.abstraction.upper)[0, 0] / 2)
+    cut, done = regions.split(state.abstraction, middle, min_width=0.1)
+    q = jnp.ones_like(state.commander.q)
+    monkeypatch.setattr(between_episodes, "_learn_where_commands_lead", lambda config, state, *_, **__: (state, {}))
+    monkeypatch.setattr(
+        between_episodes,
+        "refine",
+        lambda _, __, ___, state, *____, **_____: (
+            state.replace(abstraction=cut, commander=state.commander.replace(q=q)), {},
+        ),
+    )  # fmt: skip
+    point, none = np.ones((4, 2), np.float32), np.zeros(4, np.int32)
+    outcome = Outcome(start=point, lower=point, upper=point, end=point, weight=none + 1.0)
+    decision = Decision(
+        region=none, goal_region=none, target=none, reward=none + 0.0, next_region=none, weight=none + 1.0,
+        lost=none + 0.0, aside=none + 0.0, goal=point,
+    )  # fmt: skip
+    after, _ = between_episodes.learn(
+        config, Spec.of(breaking_env.env), None, state, known=state.commander, finished=Finished(decision, outcome),
+        num_envs=4, env_steps=jnp.float32(0), key=jax.random.key(0),
+    )  # fmt: skip
+    jax.tree.map(np.testing.assert_array_equal, after.abstraction, state.abstraction)
+    np.testing.assert_array_equal(after.commander.q, state.commander.q)
+    begun = after.renewed()
+    assert bool(done) and int(begun.abstraction.count) == int(state.abstraction.count) + 1
+    jax.tree.map(np.testing.assert_array_equal, begun.abstraction, cut)
+    assert np.asarray(begun.commander.q != state.commander.q).any()
+
+
 def test_complete_periods_enter_the_forward_models_buffer_and_cut_ones_do_not(first):
     _, end, _ = first
     items, written = jax.tree.map(np.asarray, replay.contents(end.forward_model.ring))

@@ -1,5 +1,6 @@
 """Checkpoints on disk: whole, checked, kept, and those of older versions."""
 
+import dataclasses
 import errno
 import json
 import os
@@ -307,8 +308,8 @@ def test_the_critics_of_format_4_speak_of_returns_as_they_are(tmp_path):
     new = {
         f"{level}/returns/{name}": x for level in ("tutor", "controller") for name, x in (("mean", 0), ("variance", 1))
     }
-    tries = {name for name in after if name.startswith("graph/tries/")}
-    assert set(after) - set(before) - tries == set(new) and set(before) - set(after) == {"commander/model/reach"}
+    later = {name for name in after if name.startswith(("graph/tries/", "upcoming/"))}
+    assert set(after) - set(before) - later == set(new) and set(before) - set(after) == {"commander/model/reach"}
     for name, x in new.items():
         np.testing.assert_array_equal(after[name], [x, x])
     checkpoints.close()
@@ -345,9 +346,22 @@ def test_in_format_7_nothing_was_known_of_tries_in_earlier_epochs(tmp_path):
     state = checkpoints.restore(480, jax.eval_shape(program.init, program.seed_keys()))
     new = {"graph/tries/beyond", "graph/tries/passed", "graph/tries/beside", "graph/tries/met"}
     before = checkpoints.arrays(480)
-    assert set(STAR.migrated_arrays(before, 7)) - set(before) == new
+    added = set(STAR.migrated_arrays(before, 7)) - set(before)
+    assert {name for name in added if not name.startswith("upcoming/")} == new
     assert all(not x.any() for x in jax.tree.leaves(state.graph.tries))
     np.testing.assert_array_equal(state.graph.transitions, before["graph/transitions"])
+    checkpoints.close()
+
+
+def test_in_format_8_cuts_came_at_once_so_an_epoch_begins_with_what_is_there(tmp_path):
+    checkpoints = Checkpoints(unpacked("format_8", tmp_path))
+    program = programs.build(checkpoints.config(480))
+    state = checkpoints.restore(480, jax.eval_shape(program.init, program.seed_keys()))
+    parts = ("commander", "abstraction", "graph", "sgim")
+    assert state.abstraction.count.max() > 2
+    for name in parts:
+        jax.tree.map(np.testing.assert_array_equal, getattr(state, name), getattr(state.upcoming, name))
+    assert {field.name for field in dataclasses.fields(state.upcoming)} == set(parts)
     checkpoints.close()
 
 

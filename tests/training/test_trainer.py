@@ -126,12 +126,15 @@ def test_regions_have_a_line_for_each_evaluation_and_seed_and_cover_the_space(fi
     for row in table:
         lower, upper = np.array(row["lower"]), np.array(row["upper"])
         assert np.prod(upper - lower, axis=1).sum() == pytest.approx(24.0**2)
-        same = [r for r in metrics if (r["env_steps"], r["seed"]) == (row["env_steps"], row["seed"])]
-        assert len(lower) == same[0]["abstraction/regions"]
+        before, same = (
+            next(r for r in metrics if (r["env_steps"], r["seed"]) == (env_steps, row["seed"]))
+            for env_steps in (row["env_steps"] - EPOCH, row["env_steps"])
+        )
+        assert len(lower) == same["abstraction/regions"]
         assert {len(row[key]) for key in ("chosen", "visited", "value", "target")} == {len(lower)}
         assert row["goal"] == [0, 16] and max(row["target"]) < len(lower)
-        assert len(row["reaches"]) == same[0]["refinement/edges"]
-        assert len(row["misses"]) == same[0]["refinement/misses"]
+        assert len(row["reaches"]) == before["refinement/edges"]
+        assert len(row["misses"]) == before["refinement/misses"]
 
 
 @pytest.mark.parametrize(
@@ -423,6 +426,7 @@ def test_four_devices_train_as_one_does_and_any_number_goes_on(steady, tmp_path)
     """Two epochs on four devices, the other two on one; its checkpoint goes to two as well."""
     training = """
 import json, sys
+from itertools import pairwise
 from pathlib import Path
 import jax
 from star.config.loading import parse
