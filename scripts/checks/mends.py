@@ -73,8 +73,8 @@ MENDS = (
         "    return begins, ",
     ),
     Mend(
-        "a greedy agent walks in a circle, since it is given the same target wherever it comes back",
-        "tests/agent/test_commander.py::test_who_comes_back_to_a_region_is_given_another_target_there_unless_the_goal_is_in_it",
+        "a greedy agent walks in a circle or presses against a wall: it is given the same target over and over",
+        "tests/agent/test_commander.py::test_a_target_that_was_given_in_vain_is_not_given_again_at_once_unless_the_goal_is_here",
         "star/agent/commander.py",
         "        vain=vain,\n",
         "",

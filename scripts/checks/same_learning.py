@@ -46,6 +46,7 @@ from scripts.processes import importing
 FOLDERS = ("agents", "ablations", "sgim")  # of configs/, whose files are layers
 EPOCHS, FRESH, FROM = 5, 4, 2  # that OLD trains; after which both are compared; after which NEW goes on
 METRICS = 1e-6  # how far metrics may be apart
+_UPCOMING = "upcoming/"  # begins the names of what comes with the next epoch
 ROUNDING = 1e-5  # how far numbers of a `close` row may be apart, over the largest of their leaf
 CLOCKS = ("wall_s", "env_steps_per_s")  # metrics that tell of the machine
 HASTY = "--xla_backend_optimization_level=0"
@@ -328,7 +329,7 @@ class Commands(NamedTuple):
 
 
 def leaves(run: Path, env_steps: int) -> dict[str, np.ndarray]:
-    """All leaves of the state in a checkpoint, by their names."""
+    """All leaves of the state in a checkpoint, by their names, as the next epoch begins with them."""
     path = (run / "checkpoints" / str(env_steps) / "state").absolute()
     here = jax.sharding.SingleDeviceSharding(jax.devices("cpu")[0])
     with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as reader:
@@ -336,7 +337,9 @@ def leaves(run: Path, env_steps: int) -> dict[str, np.ndarray]:
         template = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=here), shapes)
         found = reader.restore(path, args=ocp.args.StandardRestore(template))
     named = jax.tree_util.tree_flatten_with_path(found)[0]
-    return {jax.tree_util.keystr(place, simple=True, separator="/"): np.asarray(leaf) for place, leaf in named}
+    kept = {jax.tree_util.keystr(place, simple=True, separator="/"): np.asarray(leaf) for place, leaf in named}
+    upcoming = {name.removeprefix(_UPCOMING): leaf for name, leaf in kept.items() if name.startswith(_UPCOMING)}
+    return {name: leaf for name, leaf in kept.items() if not name.startswith(_UPCOMING)} | upcoming
 
 
 def bits(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> list[str]:

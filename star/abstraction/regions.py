@@ -110,6 +110,11 @@ class Box(struct.PyTreeNode):
         """Both corners as one vector."""
         return jnp.concatenate([self.lower, self.upper], axis=-1)
 
+    def distance(self, point: Float[Array, "*batch d"], scale: Float[Array, "d"]) -> Float[Array, "*batch"]:
+        """How far each `point` is from its box, in units of `scale`; 0 within."""
+        gap = jnp.maximum(jnp.maximum(self.lower - point, point - self.upper), 0.0)
+        return jnp.linalg.norm(gap / scale, axis=-1)
+
     def seen_from(self, origin: Float[Array, "*batch d"]) -> Box:
         """The box relative to `origin`."""
         return Box(lower=self.lower - origin, upper=self.upper - origin)

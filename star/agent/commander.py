@@ -37,7 +37,7 @@ from star.sgim.lessons import Marks
 
 Metrics = dict[str, Array]
 
-STILL = 0.05  # of the farthest subgoal in each dimension: who has moved less stands still
+STILL = 0.05  # of the farthest subgoal in each dimension: who has moved less stands still, or has come no nearer
 
 _RULES = {"model": planning, "q": q_learning}
 
@@ -108,7 +108,7 @@ def command(
     """The decisions of those who are due; greedy where `env_steps`, those of all environments so far, is None."""
     locate = partial(regions.locate, roadmap.abstraction)
     region, goal_region = locate(scene.position), locate(scene.goal)
-    due, journey, vain = _on_the_way(state, roadmap, memory, region, goal_region)
+    due, journey, vain = _on_the_way(task, state, roadmap, memory, scene.position, region, goal_region)
     target = values.choose(
         state,
         roadmap.allowed,
@@ -143,14 +143,20 @@ def command(
 
 
 def _on_the_way(
-    state: CommanderState, roadmap: Roadmap, memory: Memory, region: Int[Array, "B"], goal_region: Int[Array, "B"]
+    task: Task,
+    state: CommanderState,
+    roadmap: Roadmap,
+    memory: Memory,
+    position: Float[Array, "B d"],
+    region: Int[Array, "B"],
+    goal_region: Int[Array, "B"],
 ) -> tuple[Bool[Array, "B"], Journey | None, Int[Array, "B"] | None]:
     """Who is due for a decision; each one's journey, and the target that was given in vain where it is now, or -1.
 
     A decision is due where a period begins. On a journey it also is where the agent comes to a better region than ever
     before: so there are no more such decisions than regions. Who comes back to a region was given a target there in
-    vain, and would be led around in a circle by it. In training there is no journey: what is counted is where whole
-    periods lead, and random targets end circles.
+    vain, and would be led around in a circle by it; who has not come nearer to its box in a period would stay where it
+    is. In training there is no journey: what is counted is where whole periods lead, and random targets end circles.
     """
     begins, journey = memory.clock == 0, memory.journey
     if journey is None:
@@ -158,8 +164,10 @@ def _on_the_way(
     value = values.worth(state, roadmap.allowed, region, goal_region)
     same = goal_region == memory.goal_region
     best, given = jnp.where(same, journey.best, -jnp.inf), jnp.where(same[:, None], journey.given, -1)
-    back = (region != memory.region) & (region != goal_region)
-    vain = jnp.where(back, given[jnp.arange(len(region)), region], -1)
+    scale = task.spec.scale[: position.shape[-1]]
+    before, now = (memory.box.distance(point, scale) for point in (memory.start, position))
+    failed = (region != memory.region) | (begins & (now > before - STILL))
+    vain = jnp.where(failed & (region != goal_region), given[jnp.arange(len(region)), region], -1)
     return begins | (value > best), Journey(best=jnp.maximum(best, value), given=given), vain
 
 

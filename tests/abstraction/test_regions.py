@@ -101,6 +101,16 @@ def test_inactive_boxes_hold_nothing(locate):
     np.testing.assert_array_equal(locate(stale, points), locate(made, points))
 
 
+def test_the_distance_to_a_box_is_that_to_its_nearest_point_in_units_of_the_scale():
+    rng = np.random.default_rng(0)
+    lower, point, scale = rng.uniform(-9, 9, (50, 3)), rng.uniform(-12, 12, (50, 3)), np.float32([1, 2, 5])
+    upper = lower + rng.uniform(0, 9, (50, 3))
+    found = regions.Box(jnp.float32(lower), jnp.float32(upper)).distance(jnp.float32(point), scale)
+    nearest = np.clip(point, lower, upper)
+    np.testing.assert_allclose(found, np.sqrt((((point - nearest) / scale) ** 2).sum(axis=1)), rtol=1e-4, atol=1e-5)
+    assert (np.asarray(found) == 0).any()
+
+
 def test_split_gives_the_part_above_the_cut_to_the_new_region(split):
     before = grid()
     after, done = split(before, cut(2, 1, 3.0), 1.0)

@@ -137,18 +137,18 @@ def test_a_greedy_plan_is_asked_again_where_the_agent_has_come_to_a_better_regio
         assert after.journey.given[:, middle].tolist() == [-1, -1, right, -1, -1]
 
 
-def test_who_comes_back_to_a_region_is_given_another_target_there_unless_the_goal_is_in_it(in_a_row):
+def test_a_target_that_was_given_in_vain_is_not_given_again_at_once_unless_the_goal_is_here(in_a_row):
     (left, middle, right), commanded = in_a_row
-    given = np.full((4, R), -1)
-    given[:, left], given[3, right] = middle, right
-    # Back from the middle; still there; back, but with another goal; and back where the goal is.
+    given = np.full((5, R), -1)
+    given[:, left], given[4, right] = middle, right
+    # Back from the middle; no nearer to the box at (0, 0) in a period; nearer; back for another goal; at the goal.
     after = commanded(
-        [[1, 1], [1, 1], [1, 1], [7, 1]], best=[0.9] * 4, given=given, clock=[0] * 4, target=[left] * 4,
-        region=[middle, left, middle, middle], goal_region=[right, right, left, right],
+        [[1, 1], [2, 2.1], [1, 1], [1, 1], [7, 1]], best=[0.9] * 5, given=given, clock=[0] * 5, target=[left] * 5,
+        region=[middle, left, left, middle, middle], goal_region=[right, right, right, left, right],
     )  # fmt: skip
-    assert int(after.target[0]) != middle
-    assert after.target[1:].tolist() == [middle, middle, right]
-    assert after.journey.given[0, left] == after.target[0]
+    assert middle not in after.target[:2]
+    assert after.target[2:].tolist() == [middle, middle, right]
+    np.testing.assert_array_equal(after.journey.given[:2, left], after.target[:2])
 
 
 def random_batch(seed):
