@@ -111,7 +111,7 @@ class Box(struct.PyTreeNode):
         return jnp.concatenate([self.lower, self.upper], axis=-1)
 
     def distance(self, point: Float[Array, "*batch d"], scale: Float[Array, "d"]) -> Float[Array, "*batch"]:
-        """How far each `point` is from its box, in units of `scale`; 0 within."""
+        """The distance of each `point` from its box, in units of `scale`; 0 within."""
         gap = jnp.maximum(jnp.maximum(self.lower - point, point - self.upper), 0.0)
         return jnp.linalg.norm(gap / scale, axis=-1)
 

@@ -151,7 +151,7 @@ def _on_the_way(
     region: Int[Array, "B"],
     goal_region: Int[Array, "B"],
 ) -> tuple[Bool[Array, "B"], Journey | None, Int[Array, "B"] | None]:
-    """Who is due for a decision; each one's journey, and the target that was given in vain where it is now, or -1.
+    """True for those due for a decision; the journeys, and the targets that were given in vain where they are, or -1.
 
     A decision is due where a period begins. On a journey it also is where the agent comes to a better region than ever
     before: so there are no more such decisions than regions. Who comes back to a region was given a target there in
