@@ -103,8 +103,8 @@ def test_nothing_is_found_where_all_is_well(epoch):
 @pytest.mark.parametrize(
     "tensor",
     [
-        "commander/model/led",
-        "commander/q",
+        "upcoming/commander/model/led",
+        "upcoming/commander/q",
         "tutor/params/actor/params/Dense_0/kernel",
         "tutor/params/critic/params/Dense_1/bias",
         "tutor/target/critic/params/Dense_0/kernel",
