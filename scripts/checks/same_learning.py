@@ -46,8 +46,8 @@ from scripts.processes import importing
 FOLDERS = ("agents", "ablations", "sgim")  # of configs/, whose files are layers
 EPOCHS, FRESH, FROM = 5, 4, 2  # that OLD trains; after which both are compared; after which NEW goes on
 METRICS = 1e-6  # how far metrics may be apart
-_UPCOMING = "upcoming/"  # begins the names of what comes with the next epoch
 ROUNDING = 1e-5  # how far numbers of a `close` row may be apart, over the largest of their leaf
+UPCOMING = "upcoming/"  # begins the names of what comes with the next epoch
 CLOCKS = ("wall_s", "env_steps_per_s")  # metrics that tell of the machine
 HASTY = "--xla_backend_optimization_level=0"
 COMMAND = "import sys; from star.cli import main; sys.exit(main())"
@@ -338,8 +338,8 @@ def leaves(run: Path, env_steps: int) -> dict[str, np.ndarray]:
         found = reader.restore(path, args=ocp.args.StandardRestore(template))
     named = jax.tree_util.tree_flatten_with_path(found)[0]
     kept = {jax.tree_util.keystr(place, simple=True, separator="/"): np.asarray(leaf) for place, leaf in named}
-    upcoming = {name.removeprefix(_UPCOMING): leaf for name, leaf in kept.items() if name.startswith(_UPCOMING)}
-    return {name: leaf for name, leaf in kept.items() if not name.startswith(_UPCOMING)} | upcoming
+    upcoming = {name.removeprefix(UPCOMING): leaf for name, leaf in kept.items() if name.startswith(UPCOMING)}
+    return {name: leaf for name, leaf in kept.items() if not name.startswith(UPCOMING)} | upcoming
 
 
 def bits(old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray]) -> list[str]:

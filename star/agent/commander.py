@@ -8,8 +8,8 @@
     follow      once an epoch: the regions may have been cut
 
 Greedy episodes explore nothing, and follow a plan of their own (`settle`), in which a decision is also due where the
-agent has come to a better region than ever before, and is another one where it comes back to a region. But where an
-agent stands still (`standing`) Tutor and Controller act with noise.
+agent has come to a better region than ever before, and no target is given twice in vain. But where an agent stands
+still (`standing`) Tutor and Controller act with noise.
 
 Source: STAR (ICLR 2024), section 4.1.
 """
@@ -127,6 +127,7 @@ def command(
         aside, aim = marks.way.aside, jnp.where(marks.way.aside[:, None], marks.way.point, aim)
         target = jnp.where(marks.way.target >= 0, marks.way.target, target)
     around = aside | (target == goal_region)
+    memory = memory.replace(journey=journey)
     fresh = memory.replace(
         region=region,
         goal_region=goal_region,
@@ -138,8 +139,8 @@ def command(
     )
     if journey is not None:
         given = journey.given.at[jnp.arange(len(region)), region].set(target)
-        journey = journey.replace(given=jnp.where(due[:, None], given, journey.given))
-    return where(due, fresh.replace(journey=None), memory.replace(journey=None)).replace(journey=journey)
+        fresh = fresh.replace(journey=journey.replace(given=given))
+    return where(due, fresh, memory)
 
 
 def _on_the_way(

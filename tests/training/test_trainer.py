@@ -426,7 +426,6 @@ def test_four_devices_train_as_one_does_and_any_number_goes_on(steady, tmp_path)
     """Two epochs on four devices, the other two on one; its checkpoint goes to two as well."""
     training = """
 import json, sys
-from itertools import pairwise
 from pathlib import Path
 import jax
 from star.config.loading import parse
