@@ -23,7 +23,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from scripts.pages import charts
-from scripts.results import digest
+from scripts.results import digest, jaxgcrl
 from star.report import statistics
 from star.training.journal import JsonLines
 
@@ -244,7 +244,7 @@ GARA here is STAR without its Tutor, with a longer horizon and no
 
 Curves are means over seeds; bands hold all seeds.
 
-## Worth of refinement
+{jaxgcrl.section(rows)}## Worth of refinement
 
 ![Success with and without refinement in six mazes](images/results_refinement.png)
 
@@ -273,7 +273,8 @@ def charted(rows: Mapping[str, Row]) -> dict[str, list[str]]:
         "refinement": [f"{folder}/{name}" for folder in REFINED.values() for name in ("star", "no_refinement")],
         "parts": [f"ant_labyrinth/{name}" for name in PARTS.values()],
     }
-    return {chart: [path for path in paths if path in rows] for chart, paths in wanted.items()}
+    there = {chart: [path for path in paths if path in rows] for chart, paths in wanted.items()}
+    return there | {"jaxgcrl": jaxgcrl.paths(rows)}
 
 
 def bars(rows: Mapping[str, Row], groups: Sequence[str], names: Mapping[str, str], paths: Any) -> Figure:
@@ -310,14 +311,8 @@ def curves(results: Path) -> Figure:
         points = JsonLines(results / folder / "curves.jsonl").read()
         for number, (label, name) in enumerate(list(AGENTS.items())[:2]):
             mine = [point for point in points if point["name"] == name]
-            steps = sorted({point["env_steps"] for point in mine})
-            at = [[p["eval/success_any"] for p in mine if p["env_steps"] == step] for step in steps]
-            million = np.asarray(steps) / 1e6
-            axis.plot(million, [np.mean(seeds) for seeds in at], color=f"C{number}", label=label)
-            low, high = [min(seeds) for seeds in at], [max(seeds) for seeds in at]
-            axis.fill_between(million, low, high, color=f"C{number}", alpha=0.15, linewidth=0)
+            charts.band(axis, mine, "eval/success_any", color=f"C{number}", label=label)
         axis.set(title=task, ylim=(-0.02, 1.02))
-        axis.grid(alpha=0.3)
     axes[0].set_ylabel("success")
     figure.supxlabel("million env steps of each seed", fontsize="medium")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center")
@@ -336,7 +331,7 @@ def drawn(rows: Mapping[str, Row], results: Path = RESULTS) -> dict[str, Figure]
         "results_curves": curves(results),
         "results_refinement": bars(rows, list(REFINED), pair, refined),
         "results_parts": bars(rows, list(PARTS), {"": ""}, lambda part, _: f"ant_labyrinth/{PARTS[part]}"),
-    }
+    } | ({"results_jaxgcrl": jaxgcrl.curves(results)} if jaxgcrl.paths(rows) else {})
 
 
 def sources(rows: Mapping[str, Row], results: Path = RESULTS) -> str:
@@ -346,6 +341,8 @@ def sources(rows: Mapping[str, Row], results: Path = RESULTS) -> str:
     for folder in FOLDERS.values():
         points = JsonLines(results / folder / "curves.jsonl").read()
         told.update(json.dumps([p for p in points if p["name"] in list(AGENTS.values())[:2]]).encode())
+    for path in jaxgcrl.paths(rows):
+        told.update(json.dumps(jaxgcrl.evaluations(results / path)).encode())
     return told.hexdigest()[:16]
 
 
