@@ -11,6 +11,8 @@ import pytest
 
 from scripts.pages import charts
 from scripts.results import digest, jaxgcrl, page, tutoring
+from scripts.results.rows import DIGESTS, MARK, Row, read
+from scripts.results.verdicts import standing, unmeasured, verdicts
 from star.config.loading import load
 
 ROOT = Path(__file__).parents[1]
@@ -20,7 +22,7 @@ DIGEST = {"settings": "a1", "moved": {"controller": 1.25, "tutor": 0.5}}
 
 @pytest.fixture(scope="module")
 def rows():
-    return page.read()
+    return read()
 
 
 def test_the_page_and_the_tables_keep_step_with_the_json_files(rows):
@@ -76,27 +78,30 @@ def test_a_row_is_marked_as_of_an_older_version_unless_all_its_digests_are_those
     path.write_text(json.dumps(report([0.9, 1.0], digests=digests)), encoding="utf-8")
     (tmp_path / "other.json").write_text("[]", encoding="utf-8")
     kept = {"commit": "c0ffee", "rows": {"ant_maze/one_by_one/star": today} if today else {}}
-    (tmp_path / page.DIGESTS.name).write_text(json.dumps(kept), encoding="utf-8")
-    found = page.read(tmp_path)
+    (tmp_path / DIGESTS.name).write_text(json.dumps(kept), encoding="utf-8")
+    found = read(tmp_path)
     assert [row.today for row in found.values()] == [current]
     (line,) = page.table(found).splitlines()[2:]
-    task = "Ant Maze" if current else f"Ant Maze {page.MARK}"
+    task = "Ant Maze" if current else f"Ant Maze {MARK}"
     assert line.startswith(f"| {task} | **.95** [") and line.endswith("] | .84 | 12 s | H100, 2 seeds |")
 
 
 def test_who_is_ahead_is_told_only_where_the_interval_leaves_out_zero():
     def row(*success, today=True):
-        return page.Row("", report(success), today)
+        return Row("", report(success), today)
 
     wide = {"ant_maze/star": row(0.9, 0.95, 0.9), "ant_maze/gara": row(0.2, 1.0, 0.9), "ant_maze/flat": row(0, 0.01, 0)}
-    gara, flat = page.verdicts(wide)
+    found = verdicts(wide)
+    gara, flat = (one.line for one in found)
+    assert standing(found) == "**STAR is not ahead of** GARA: Ant Maze."
+    assert standing(found[1:]) == "STAR is ahead of all agents that are measured, on every task."
     assert "| not told apart | +0.22 [" in gara and "| ahead | +0.91 [" in flat
     assert gara.endswith("] | 3x16.4/3x16.4 |")
-    assert "| behind | " in page.verdicts({"ant_maze/star": wide["ant_maze/flat"], "ant_maze/gara": row(1, 1, 1)})[0]
+    assert "| behind | " in verdicts({"ant_maze/star": wide["ant_maze/flat"], "ant_maze/gara": row(1, 1, 1)})[0].line
     for ours, theirs in ((True, True), (True, False), (False, True)):
         rows = {"ant_maze/star": row(1, 1, today=ours), "ant_maze/gara": row(0, 0, today=theirs)}
-        assert page.verdicts(rows)[0].startswith("| GARA, " if ours and theirs else f"| GARA {page.MARK}, ")
-    assert page.unmeasured(wide).startswith("STAR on Ant Maze Cam, Ant Fall, labyrinth; GARA on ")
+        assert verdicts(rows)[0].line.startswith("| GARA, " if ours and theirs else f"| GARA {MARK}, ")
+    assert unmeasured(wide).startswith("STAR on Ant Maze Cam, Ant Fall, labyrinth; GARA on ")
 
 
 def at_the_goal(steps, *, first, way):
@@ -119,14 +124,14 @@ def test_the_part_on_jaxgcrl_tells_speed_way_and_the_most_that_an_agent_could_ha
     runs = [{"seeds": [0, 1], "env_steps_per_s": 300_000, "digest": None}]
     told = {"env_steps_per_seed": 9_000_000, "seeds": seeds, "runs": runs}
     rows = {
-        "jaxgcrl/ant_big_maze/frugal": page.Row("", told, today=True),
-        "jaxgcrl/ant_hardest_maze/crl": page.Row("", told | {"seeds": none, "runs": [runs[0] | {"seeds": [0]}]}, False),
+        "jaxgcrl/ant_big_maze/frugal": Row("", told, today=True),
+        "jaxgcrl/ant_hardest_maze/crl": Row("", told | {"seeds": none, "runs": [runs[0] | {"seeds": [0]}]}, False),
     }
     frugal, crl = [line for line in jaxgcrl.section(rows).splitlines() if line.startswith(("| big", "| hardest"))]
     # 2 x 9 M env steps in 60 s; 20 m in 10 s and in 5 s are 3 m/s, and 150 of 1,000 env steps
     assert frugal.startswith("| big maze, STAR, frugal | 9.0 | 60 | **750** [115, 1000] | **625** [307, 943] | ")
     assert frugal.endswith("| 20 | 3.0 | 850 |")
-    assert crl == f"| hardest maze, CRL {page.MARK} | 9.0 | 30 | **0** | **0** |  |  |  |"
+    assert crl == f"| hardest maze, CRL {MARK} | 9.0 | 30 | **0** | **0** |  |  |  |"
     folder = tmp_path / "jaxgcrl" / "ant_big_maze"
     folder.mkdir(parents=True)
     points = [

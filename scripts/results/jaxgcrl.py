@@ -7,17 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from scripts.pages import charts
+from scripts.results.rows import Row
 from star.report import statistics
 from star.training.journal import JsonLines
-
-if TYPE_CHECKING:
-    from scripts.results.page import Row
 
 MAZES = {"big maze": "jaxgcrl/ant_big_maze", "hardest maze": "jaxgcrl/ant_hardest_maze"}
 AGENTS = {"STAR": "one_by_one/star", "STAR, frugal": "frugal", "CRL": "crl", "ChronoSRL": "chronosrl"}

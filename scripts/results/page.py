@@ -17,21 +17,19 @@ import subprocess
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from scripts.pages import charts
 from scripts.results import digest, jaxgcrl
-from star.report import statistics
+from scripts.results.rows import DIGESTS, MARK, RESULTS, Row, read
+from scripts.results.verdicts import AGENTS, FOLDERS, standing, unmeasured, verdicts
 from star.training.journal import JsonLines
 
 ROOT = Path(__file__).parents[2]
-RESULTS = ROOT / "results"
-DIGESTS = RESULTS / "digests.json"
 BEGIN, END = "<!-- made by scripts/results/page.py -->", "<!-- made until here -->"
-MARK = "†"
 
 # The name of a task, the row that answers for it, and the published success (arXiv 2401.09870).
 TASKS = (
@@ -43,8 +41,6 @@ TASKS = (
     ("Ant Fall, no GPU", "ant_fall_cpu/star", ""),
     ("Point Maze, no GPU", "point_maze/star", ""),
 )
-FOLDERS = {"Ant Maze": "ant_maze", "Ant Maze Cam": "ant_maze_cam", "Ant Fall": "ant_fall", "labyrinth": "ant_labyrinth"}
-AGENTS = {"STAR": "star", "GARA": "gara", "HIRO": "hiro", "HRAC": "hrac", "flat": "flat"}
 REFINED = {
     "labyrinth": "ant_labyrinth",
     "big maze": "ant_big_maze",
@@ -77,44 +73,6 @@ The first goes on where it was interrupted. A row holds seeds, command, commit, 
 [learning digest](glossary.md#measurement). `results/README.md` lists all raw figures. Earlier ones are in the
 [notebook](notebook/results.md).
 """
-
-
-class Row(NamedTuple):
-    """A measured agent: its JSON, and whether its digest is today's."""
-
-    path: str
-    report: Mapping[str, Any]
-    today: bool
-
-    @property
-    def scores(self) -> np.ndarray:
-        """success_any of each seed."""
-        return np.asarray([seed["success_any"] for seed in self.report["seeds"]])
-
-    @property
-    def interval(self) -> tuple[float, float, float]:
-        """Mean, low and high over seeds; the three are one number where there is one seed."""
-        mean, low, high = statistics.over_seeds(self.scores, episodes=self.report["seeds"][0]["episodes"])
-        return float(mean), float(np.nan_to_num(low, nan=mean)), float(np.nan_to_num(high, nan=mean))
-
-    @property
-    def mark(self) -> str:
-        """The mark behind the name of a row of an older version."""
-        return "" if self.today else f" {MARK}"
-
-
-def read(results: Path = RESULTS) -> dict[str, Row]:
-    """All rows below `results`, by their path without ending."""
-    kept = results / DIGESTS.name
-    today = json.loads(kept.read_text(encoding="utf-8"))["rows"] if kept.exists() else {}
-    rows = {}
-    for path in sorted(results.rglob("*.json")):
-        report = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(report, dict) and {"task", "name", "seeds", "runs"} <= report.keys():
-            name = path.relative_to(results).with_suffix("").as_posix()
-            same = (digest.same(run.get("digest"), today.get(name)) for run in report["runs"])
-            rows[name] = Row(name, report, all(same))
-    return rows
 
 
 def table(rows: Mapping[str, Row]) -> str:
@@ -161,60 +119,17 @@ def hardware(rows: Mapping[str, Row]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def verdicts(rows: Mapping[str, Row]) -> list[str]:
-    """A line for each task and rival: whether STAR is ahead, by Welch's interval of the difference.
-
-    It is marked if either row is of an older version.
-    """
-    lines = []
-    for task, folder in FOLDERS.items():
-        ours = rows.get(f"{folder}/star")
-        for agent, name in list(AGENTS.items())[1:]:
-            theirs = rows.get(f"{folder}/{name}")
-            if ours and theirs:
-                budgets = "/".join(map(_budget, (ours, theirs)))
-                mark = theirs.mark or ours.mark
-                lines.append(f"| {agent}{mark}, {task} | {_difference(ours, theirs)} | {budgets} |")
-    return lines
-
-
-def _budget(row: Row) -> str:
-    """Seeds x million env steps of each."""
-    return f"{len(row.report['seeds'])}x{row.report['env_steps_per_seed'] / 1e6:.1f}"
-
-
-def _difference(ours: Row, theirs: Row) -> str:
-    episodes = min(row.report["seeds"][0]["episodes"] for row in (ours, theirs))
-    found = statistics.difference({"": list(ours.scores)}, {"": list(theirs.scores)}, episodes=episodes)
-    assert found is not None
-    mean, low, high = found
-    word = "ahead" if low > 0 else "behind" if high < 0 else "not told apart"
-    return f"{word} | {mean:+.2f} [{low:+.2f}, {high:+.2f}]"
-
-
-def unmeasured(rows: Mapping[str, Row]) -> str:
-    """The agents without a row, with their tasks."""
-    missing = {
-        agent: [task for task, folder in FOLDERS.items() if f"{folder}/{name}" not in rows]
-        for agent, name in AGENTS.items()
-    }
-    everywhere = len(FOLDERS)
-    return "; ".join(
-        agent if len(tasks) == everywhere else f"{agent} on {', '.join(tasks)}"
-        for agent, tasks in missing.items()
-        if tasks
-    )
-
-
 def page(rows: Mapping[str, Row]) -> str:
     """The text of docs/results.md."""
     shown = list(dict.fromkeys(path for chart in charted(rows).values() for path in chart))
     shown += [path for _, path, _ in TASKS if path in rows and path not in shown]
     older = sum(not rows[path].today for path in shown)
-    missing = unmeasured(rows)
+    missing, found = unmeasured(rows), verdicts(rows)
     return f"""# Results
 
 {BEGIN}
+
+{standing(found)}
 
 `python scripts/results/page.py` makes this page from the JSON files in `results/`. {_age(older, len(shown))}
 
@@ -233,7 +148,7 @@ def page(rows: Mapping[str, Row]) -> str:
 
 | STAR beside | STAR is | difference in success | seeds x M env steps |
 |---|---|---|---|
-{chr(10).join(verdicts(rows))}
+{chr(10).join(one.line for one in found)}
 
 Bars are means over seeds, lines 95 % intervals, Welch's for differences. Seeds train side by side, unlike those above.
 GARA here is STAR without its Tutor, with a longer horizon and no
