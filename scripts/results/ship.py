@@ -19,6 +19,7 @@ import jax
 
 import star
 from envs.common import files
+from star.agent.sections import AgentConfig
 from star.agent.slim import slim
 from star.agent.state import TrainState
 from star.config.agents import FOLDER
@@ -43,7 +44,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         alone = Path(folder) / options.name
         found = []
-        for kept, where in ((lambda state: state, Path(folder) / "whole"), (slim, alone)):
+        for kept, where in ((lambda config, state: state, Path(folder) / "whole"), (slim, alone)):
             write(options.run, options.checkpoint, where, kept)
             evaluated = star.evaluate(where, {"trainer.eval_episodes": 200, "env.engine": "auto"})
             found.append([evaluated[name] for name in ("success_final", "success_any", "distance", "path_length")])
@@ -58,7 +59,7 @@ def main() -> None:
     print(f"{out}: {out.stat().st_size:,} bytes, success_final {found[0][0]:.3f} of 200 episodes")
 
 
-def write(run_dir: Path, wanted: str, alone: Path, kept: Callable[[TrainState], TrainState]) -> None:
+def write(run_dir: Path, wanted: str, alone: Path, kept: Callable[[AgentConfig, TrainState], TrainState]) -> None:
     """The first agent in a checkpoint of `run_dir` as a run of its own, with what is `kept` of its state."""
     program = programs.build(load_to_act(run_dir, {}))
     env_steps, states = load_state(program, run_dir, wanted)
@@ -68,7 +69,7 @@ def write(run_dir: Path, wanted: str, alone: Path, kept: Callable[[TrainState], 
     alone.mkdir()
     run_folder.note(alone, config)
     checkpoints = Checkpoints(alone)
-    checkpoints.save(env_steps, kept(jax.tree.map(lambda leaf: leaf[:1], states)), config, score=None)
+    checkpoints.save(env_steps, kept(program.hyper, jax.tree.map(lambda leaf: leaf[:1], states)), config, score=None)
     checkpoints.close()
 
 

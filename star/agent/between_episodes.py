@@ -4,7 +4,8 @@
     refinement       examines pairs of regions and cuts some
     Commander, SGIM  follow the cuts; the Commander fades and plans anew
 
-Periods cut short by the end of an episode teach the forward model nothing, because they did not last k steps.
+Periods cut short by the end of an episode teach the forward model nothing, because they did not last k steps; unless
+success ended it, where the agent counts as having stayed.
 """
 
 from __future__ import annotations

@@ -80,6 +80,7 @@ def begin(position: Float[Array, "B d"]) -> Memory:
         target=nothing,
         box=Box(lower=jnp.zeros_like(position), upper=jnp.zeros_like(position)),
         start=position,
+        goal=jnp.zeros_like(position),
         reward=jnp.zeros(len(position)),
         aside=jnp.zeros(len(position), bool),
     )
@@ -134,6 +135,7 @@ def command(
         target=target,
         box=target_box(task, roadmap.abstraction, target, around=around, point=aim),
         start=jnp.where((memory.clock == 0)[:, None], scene.position, memory.start),
+        goal=scene.goal,
         reward=jnp.full_like(memory.reward, start_reward(section)),
         aside=aside,
     )
@@ -206,7 +208,7 @@ def experience(
         weight=weight,
         lost=lost,
         aside=memory.aside.astype(weight.dtype),
-        goal=task.spec.goal_point(segment.obs[0]),
+        goal=memory.goal,
         shown=None if marks.shown is None else marks.shown.astype(weight.dtype),
     )
     box = memory.box

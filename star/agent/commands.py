@@ -22,7 +22,7 @@ def evaluate(
     """Evaluate checkpoints (run, which one) on test goals, a grid of goals or another task, and compare groups."""
     task, others = _split_task(overrides)
     configs = {run: load_to_act(run, others) for run, _ in chosen}
-    out = options.out or (chosen[0][0] / "evaluation" if options.goals == "grid" else None)
+    out = options.out or (_own_place(chosen[0][0]) if options.goals == "grid" else None)
 
     from star.agent import exam_results, exam_tables, exams  # after what can be refused at once
 
@@ -43,6 +43,14 @@ def evaluate(
     for path in written:
         print(path)
     return 0
+
+
+def _own_place(run_dir: Path) -> Path:
+    """The folder of a run for an evaluation of its agent."""
+    if agents.is_unpacked(run_dir):
+        name = agents.told(run_dir)
+        raise ConfigError(f"--goals: grid writes files, and {name} has no folder for them; add --out DIR")
+    return run_dir / "evaluation"
 
 
 def measure(run_dir: Path, overrides: Mapping[str, Any], *, checkpoint: str, seed: int) -> list[dict[str, Any]]:

@@ -40,6 +40,8 @@ class Memory(struct.PyTreeNode):
     target: Int[Array, "B"]
     box: Box
     start: Float[Array, "B d"]
+    goal: Float[Array, "B d"]
+    """Point of the goal when the target was chosen."""
     reward: Float[Array, "B"]
     aside: Bool[Array, "B"]
     """True if the box is that around a waypoint, not the target region or the goal's."""
@@ -52,7 +54,8 @@ class Decision(struct.PyTreeNode):
 
     `weight` is 1 where the period really lasted k env steps, `lost` is 1 where the task was terminated in it,
     `aside` is 1 where what was commanded was a waypoint, which tells nothing of its region, and `shown` is 1 where a
-    teacher chose the target. The reward is that for the goal, which was at the point `goal`.
+    teacher chose the target. The reward is that for the goal, which was at the point `goal` when it
+    was chosen.
     """
 
     region: Int[Array, "N"]

@@ -18,6 +18,7 @@ from envs.common import files
 from star.agent import exam_figures
 from star.agent.episodes import MEASURES
 from star.agent.sections import Config
+from star.config import agents
 from star.config.section import ConfigError
 from star.report import statistics
 from star.report.history import labels
@@ -39,8 +40,8 @@ def compare(rows: Sequence[Mapping[str, Any]], groups: Mapping[str, Sequence[Pat
     scores: dict[str, dict[str, dict[str, list[float]]]] = {}
     episodes = min((seed["episodes"] for row in last.values() for seed in row["seeds"]), default=None)
     for name, runs in groups.items():
-        scores[name] = {measure: _scores([last[str(run)] for run in runs], measure) for measure in MEASURES}
-        entry: dict[str, Any] = {"name": name, "runs": [str(run) for run in runs]}
+        scores[name] = {measure: _scores([last[agents.told(run)] for run in runs], measure) for measure in MEASURES}
+        entry: dict[str, Any] = {"name": name, "runs": [agents.told(run) for run in runs]}
         for measure, tasks in scores[name].items():
             every = np.concatenate(list(tasks.values()))
             mean, *interval = statistics.over_tasks(tasks, episodes=episodes)
@@ -108,7 +109,8 @@ def check_groups(groups: Mapping[str, Sequence[Path]], configs: Mapping[Path, Co
             for seed in range(settings.seed, settings.seed + settings.num_seeds):
                 other = seen.setdefault((task, seed), run)
                 if other != run:
-                    raise ConfigError(f"--group: {name}: seed {seed} is in {other} and in {run}; allowed: once")
+                    both = " and in ".join(map(agents.told, (other, run)))
+                    raise ConfigError(f"--group: {name}: seed {seed} is in {both}; allowed: once")
 
 
 def check_place(out: Path, *, force: bool) -> None:

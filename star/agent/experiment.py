@@ -33,6 +33,7 @@ from star.training.journal import mean
 _EVALUATED = ("success_any", "success_final", "distance", "return", "flipped", "time_at_goal")
 _SHARE = "sgim/share_"
 _FAULTS = ("env/non_finite", "env/overflow")
+_OF_REWARDS = ("reward", "reward_scale", "termination_penalty", "tilt_penalty", "tilt_start", "tilt_steps")
 
 
 class Star(Experiment):
@@ -115,9 +116,13 @@ class Star(Experiment):
         return found
 
     def notes(self) -> list[str]:
-        """A user's map that marks no goal, and levels that learn from old transitions: how often from each."""
+        """A user's map that marks no goal, what a learner without a reward ignores, and samples per transition."""
         said = [(name, level.settings.samples_per_transition(size)) for name, level, size in self.config.learners()]
         notes = [f"{name}: {samples:.3g} samples per new transition" for name, samples in said if samples is not None]
+        control = self.config.controller
+        idle = [key for key in _OF_REWARDS if key in control.model_dump(exclude_defaults=True)]
+        if control.settings.futures and idle:
+            notes.append(f"controller.learner {control.learner} sees no reward; without effect: {', '.join(idle)}")
         section = self.config.env
         ours = "map" in section.options and not plugins.is_plugin(section.name)
         if ours and not any(self.test_env.arena.cells(arena.GOAL)):

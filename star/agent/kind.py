@@ -54,6 +54,8 @@ STAR = Kind(
         "commander.trust",
         "refinement.neighbours",
         "abstraction.min_share",
+        "sgim.selection.min_side",
+        "sgim.selection.min_width",
     ),
     anywhere={"env.engine": "auto"},
     commands={

@@ -10,7 +10,7 @@ from typing import Any
 
 PATIENCE = 10  # epochs without new ground
 ENOUGH = 0.5  # success_final of agents that need none
-KEYS = ("abstraction/regions", "refinement/table_full", "commander/ground", "eval/success_final")
+KEYS = ("refinement/table_full", "commander/ground", "eval/success_final")
 _SHARE = 0.95  # of the most ground in an epoch: what is less than that beyond it is luck
 _EVALUATIONS = 3
 
@@ -21,8 +21,7 @@ def notices(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     full = next((row for row in rows if row.get("refinement/table_full") == 1), None)
     if full is not None:
         found["room"] = (
-            f"the table of regions is full, {full['abstraction/regions']:.0f} since env step {full['env_steps']:,}; "
-            "abstraction.max_regions makes room"
+            f"the table of regions is full since env step {full['env_steps']:,}; abstraction.max_regions makes room"
         )
     success = [row["eval/success_final"] for row in rows if row.get("eval/success_final") is not None]
     ground = [row["commander/ground"] for row in rows if row.get("commander/ground") is not None]

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from star.agent.sections import AgentConfig
 from star.agent.state import TrainState
 from star.training.state import leaf_name
 
@@ -16,12 +17,18 @@ _NEEDED = (
     *(f"commander/model/{name}" for name in ("led", "lost", "rewards", "visits")),
     *(f"{level}/{name}" for level in ("tutor", "controller") for name in _POLICY),
 )
-_WITHOUT_MODEL = "commander/q"  # of Q-learning: plans are made anew
+_VALUES = "commander/q"  # greedy plans for success are made anew, see `planning.settle`
 
 
-def slim(state: TrainState) -> TrainState:
-    """`state`, with 0 in all that greedy episodes do not read. It acts as before, and cannot be trained further."""
-    needed = _NEEDED if state.commander.model is not None else (*_NEEDED, _WITHOUT_MODEL)
+def slim(config: AgentConfig, state: TrainState) -> TrainState:
+    """`state`, with 0 in all that greedy episodes do not read. It acts as before, and cannot be trained further.
+
+    A level with a learner of a user's own is kept as it is.
+    """
+    section, levels = config.commander, {"tutor": config.tutor, "controller": config.controller}
+    needed = list(_NEEDED) + [name for name, level in levels.items() if level.learner not in level.built_in]
+    if section.learner != "model" or section.reward != "success":
+        needed.append(_VALUES)
 
     def kept(path: Any, leaf: jax.Array) -> jax.Array:
         name = leaf_name(path)

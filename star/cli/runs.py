@@ -29,11 +29,11 @@ def chosen(options: argparse.Namespace) -> tuple[list[tuple[Path, str]], dict[st
     for name, other in itertools.combinations(groups, 2):
         for run in groups[name]:
             if run in groups[other]:
-                raise ConfigError(f"--group: {run} is both in {name} and in {other}")
+                raise ConfigError(f"--group: {agents.told(run)} is both in {name} and in {other}")
     grouped = {run for runs in groups.values() for run in runs}
     for run in single:
         if run not in grouped:
-            groups[str(run)] = [run]
+            groups[agents.told(run)] = [run]
     return found, groups
 
 
@@ -62,5 +62,6 @@ def kind_of(runs: Sequence[Path], command: str) -> Kind:
     names = [experiment_of(run) for run in runs]
     for run, name in zip(runs, names, strict=True):
         if name != names[0]:
-            raise ConfigError(f"{run}: is of experiment {name}, {runs[0]} of {names[0]}; star {command} takes one kind")
+            said = f"{agents.told(run)}: is of experiment {name}, {agents.told(runs[0])} of {names[0]}"
+            raise ConfigError(f"{said}; star {command} takes one kind")
     return loading.kind_of(runs[0])

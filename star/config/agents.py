@@ -28,9 +28,14 @@ def find(run_dir: Path) -> Path:
     return _unpacked(name) if not os.path.lexists(run_dir) and name in names() else run_dir
 
 
+def is_unpacked(run_dir: Path) -> bool:
+    """True if `find` has unpacked an agent there, so that the folder goes with this process."""
+    return run_dir in _places
+
+
 def told(run_dir: Path) -> str:
     """`run_dir` in the words of who gave it: the name of an agent that `find` has unpacked there."""
-    return run_dir.name if run_dir in _places else str(run_dir)
+    return run_dir.name if is_unpacked(run_dir) else str(run_dir)
 
 
 def near(run_dir: Path) -> str:

@@ -242,9 +242,11 @@ def _without(values: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
     """Nested `values` but for these dotted `keys`."""
     left = dict(values)
     for key in keys:
-        section, _, name = key.rpartition(".")
-        if isinstance(inner := left.get(section), Mapping):
-            left[section] = {one: value for one, value in inner.items() if one != name}
+        name, _, rest = key.partition(".")
+        if not rest:
+            left.pop(name, None)
+        elif isinstance(inner := left.get(name), Mapping):
+            left[name] = _without(inner, [rest])
     return left
 
 

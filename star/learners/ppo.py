@@ -151,7 +151,7 @@ def update(
     imitation: Imitation | None = None,
     key: Array,
 ) -> tuple[PPOState, Metrics]:
-    """Learn from one rollout [T, B] that `state` itself has collected.
+    """Learn from one rollout [T, B] that `state` itself has collected; nothing if all of it has weight 0.
 
     `penalty(batch, action)` [N] is added to the loss of the actor whose mean is `action`, and so is that of
     `imitation`.
@@ -172,18 +172,20 @@ def update(
     (params, optimizer, learning_rate), metrics = jax.lax.scan(
         one_pass, (state.params, state.optimizer, state.learning_rate), jax.random.split(key, config.passes)
     )
-    new_state = PPOState(
+    learnt = PPOState(
         params=params,
         optimizer=optimizer,
         normalizer=state.normalizer.update(rollout.obs, rollout.weight),
         returns=returns,
         learning_rate=learning_rate,
     )
+    something = rollout.weight.sum() > 0
+    state = jax.tree.map(lambda new, old: jnp.where(something, new, old), learnt, state)
     metrics = jax.tree.map(jnp.mean, metrics) | {
-        "learning_rate": learning_rate,
-        "std": jnp.exp(params["log_std"]).mean(),
+        "learning_rate": state.learning_rate,
+        "std": jnp.exp(state.params["log_std"]).mean(),
     }
-    return new_state, metrics
+    return state, metrics
 
 
 def advantages(

@@ -8,7 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from star.config.run import EXPERIMENTS, RunConfig, TrainerConfig, module_name, simple
 from star.config.section import Positive, Section, setting
-from star.sgim.sections import SelectionConfig, Sha256, TeacherName
+from star.sgim.sections import CuttingConfig, Sha256, TeacherName
 
 
 class WorldConfig(Section):
@@ -87,9 +87,9 @@ class ChoiceConfig(Section):
     )
 
     @property
-    def selection(self) -> SelectionConfig:
+    def selection(self) -> CuttingConfig:
         """The same for `star.sgim.selection`."""
-        return SelectionConfig.model_construct(
+        return CuttingConfig.model_construct(
             random=self.random, sharpness=self.sharpness, optimism=self.optimism, drift=self.drift
         )
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from star.sgim.sections import SelectionConfig as Config
+from star.sgim.sections import CuttingConfig as Config
 
 if TYPE_CHECKING:
     from star.sgim.cuts import follow, on_split, split

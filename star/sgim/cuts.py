@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 from envs.common.batching import where
 from star.abstraction import regions
 from star.abstraction.regions import Abstraction, Change, Cut, Split
-from star.sgim.sections import SelectionConfig
+from star.sgim.sections import CuttingConfig
 from star.sgim.selection import SgimState, mean_where, newest_first
 
 QUANTILES = 9  # places where a cut is tried along each dimension
@@ -56,7 +56,7 @@ def follow(state: SgimState, change: Change) -> SgimState:
     return jax.lax.scan(lambda known, split: (on_split(known, change.after, split), None), state, change.splits)[0]
 
 
-def split(config: SelectionConfig, state: SgimState) -> tuple[SgimState, Bool[Array, ""]]:
+def split(config: CuttingConfig, state: SgimState) -> tuple[SgimState, Bool[Array, ""]]:
     """Make the cut between whose two sides progress differs most, and say whether there was one.
 
     For use without another owner of the regions. Of the cuts through regions with a full window, at quantiles of their

@@ -37,8 +37,6 @@ class SelectionConfig(Section):
     focus: float = setting(
         0.1, "Near the best point means within this share of the region's width.", unit="", gt=0, le=1
     )
-    min_side: Positive = setting(8, "So many remembered goals lie on each side of a cut at least.", unit="goals")
-    min_width: float = setting(1e-3, "No region is cut narrower than this.", unit="units of goals", gt=0)
 
     @model_validator(mode="after")
     def _shares_fit(self) -> Self:
@@ -51,6 +49,13 @@ class SelectionConfig(Section):
         if 2 * self.per_block > self.window:
             raise ValueError(f"per_block {self.per_block} is more than half of window {self.window}")
         return self
+
+
+class CuttingConfig(SelectionConfig):
+    """SGIM's choice in regions that it cuts by itself."""
+
+    min_side: Positive = setting(8, "So many remembered goals lie on each side of a cut at least.", unit="goals")
+    min_width: float = setting(1e-3, "No region is cut narrower than this.", unit="units of goals", gt=0)
 
 
 class EpochSelectionConfig(SelectionConfig):

@@ -77,7 +77,7 @@ def fixed_frequency(
     rule = sgim(config, abstraction, [1.0] * strategies)
 
     def select(state: Any, *, key: Array) -> tuple[Array, Array]:
-        region = jax.random.categorical(key, jnp.log(_by_progress(config, state)))
+        region = jax.random.categorical(key, jnp.log(_by_progress(state)))
         return region, jnp.where(state.blocks % every == every - 1, teacher, 0)
 
     return Selector(rule.state, select, rule.update)
@@ -151,7 +151,7 @@ def exp4(
     start = (rule.state, none, jnp.zeros(strategies + 2), jnp.zeros(HISTORY), jnp.zeros((), jnp.int32))
 
     def advice(known: Any) -> Float[Array, "experts arms"]:
-        alone = _by_progress(config, known)[:, None] * jnp.eye(strategies)[:, None]
+        alone = _by_progress(known)[:, None] * jnp.eye(strategies)[:, None]
         own = selection.probabilities(config, known)
         return jnp.stack([jnp.full(arms, 1 / arms), own.ravel(), *alone.reshape(strategies, arms)])
 
@@ -235,7 +235,7 @@ def _fitted(points: Float[Array, "n d"], most: int, *, key: Array) -> Mixture:
     )
 
 
-def _by_progress(config: SelectionConfig, state: SgimState, *, random: float = 0.2) -> Float[Array, "R"]:
+def _by_progress(state: SgimState, *, random: float = 0.2) -> Float[Array, "R"]:
     """Probabilities of regions in proportion to the progress over their windows; a share `random` is even."""
     grown, even = jnp.maximum(selection.progress(state), 0.0), 1 / len(state.written)
     total = grown.sum()

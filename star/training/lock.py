@@ -6,8 +6,10 @@ import contextlib
 import fcntl
 import os
 import platform
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TextIO
 
 from envs.common.errors import UserError
 from star.config.section import ConfigError
@@ -42,7 +44,7 @@ def locked(run_dir: Path, *, warn: Callable[[str], None]) -> Iterator[None]:
         raise ConfigError(f"{run_dir}: cannot be written: {error.strerror}") from None
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(file)
         except BlockingIOError:
             file.seek(0)
             holder = file.read(200).strip() or "another process"
@@ -60,3 +62,12 @@ def locked(run_dir: Path, *, warn: Callable[[str], None]) -> Iterator[None]:
             if new:
                 path.unlink(missing_ok=True)
             raise
+
+
+def _lock(file: TextIO) -> None:
+    """Lock `file`, at a second try if need be: `held` of another process has it for a moment."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        time.sleep(0.1)
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import jax
 import numpy as np
 
 from envs.common import extras, modes
+from envs.common.errors import UserError
 from star import devices
 from star.config import kinds
 from star.config.kinds import Kind
@@ -121,7 +123,10 @@ class Program:
         """Keys of one evaluation, one per seed, apart from all keys of training.
 
         `number` is the epoch in the stream of evaluations during training, or the seed that a user chose afterwards.
+        Raises `UserError` if it is no whole number from 0 to 2^31 - 1.
         """
+        if not (isinstance(number, Integral) and 0 <= number < 2**31):
+            raise UserError(f"seed of an evaluation: {number!r} is not a whole number from 0 to 2^31 - 1")
         return evaluation_keys(self.seeds, [number] * len(self.seeds), stream=stream)
 
 

@@ -20,7 +20,7 @@ from operator import methodcaller
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from envs.common import extras
+from envs.common import extras, files
 from star.config.run import RunConfig
 from star.config.section import ConfigError
 from star.training.journal import by_step, mean
@@ -174,7 +174,8 @@ class WandB:
         self._run.finish()
 
     def _remember(self) -> None:
-        self._memory.write_text(json.dumps({"id": self._id, "env_steps": self._told}))
+        with files.whole(self._memory) as path:
+            path.write_text(json.dumps({"id": self._id, "env_steps": self._told}), encoding="utf-8")
 
 
 class Sinks:

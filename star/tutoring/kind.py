@@ -19,5 +19,6 @@ TUTORING = Kind(
     row={"level": list, "mastered": list, "practised": list},
     # SGIM's, before the first exercise of a skill
     may_be_nan=("seen/own/mean",),
+    gone=("teaching.selection.min_side", "teaching.selection.min_width"),
     commands={"discover": lazily("star.tutoring.discover:discover")},
 )

@@ -68,7 +68,7 @@ def test_a_slim_agent_acts_as_the_whole_one_and_holds_no_more_than_that_takes(ru
     obs = evaluated(run, EPISODES)[0][1]
     whole = np.stack([agent.act(one) for one in obs])
     state = agent._state
-    agent._state = slim(state)
+    agent._state = slim(agent.config.hyper(), state)
     try:
         agent.reset()
         np.testing.assert_array_equal(np.stack([agent.act(one) for one in obs]), whole)
@@ -264,6 +264,9 @@ def test_training_and_evaluating_return_what_the_commands_print(tmp_path, monkey
         star.train("small.yaml", run_dir=folder)
     with pytest.raises(UserError, match="'all' is not allowed"):
         star.evaluate(folder, checkpoint="all")
+    for seed in (-1, 2**31, 0.5):
+        with pytest.raises(UserError, match=r"is not a whole number from 0 to 2\^31 - 1"):
+            star.evaluate(folder, seed=seed)
     assert [path.name for path in Path("runs").iterdir()] == [folder.name]
 
 

@@ -541,13 +541,14 @@ def test_a_period_that_success_ends_counts_as_if_the_agent_stayed_for_the_rest_o
     )  # fmt: skip
     roadmap = Roadmap(abstraction=table, allowed=EVERYTHING, believed=None)
     memory = commander.begin(obs[0, :, :2])
-    memory = memory.replace(clock=memory.clock + clock, reward=jnp.full(3, so_far))
+    memory = memory.replace(clock=memory.clock + clock, reward=jnp.full(3, so_far), goal=memory.goal + 7)
     run = jax.jit(lambda memory, passed: commander.experience(chosen, task, roadmap, memory, passed, Marks()))
     after, (decision, outcome) = jax.device_get(run(memory, passed))
     whole = float(clock == 4)
     assert decision.weight.tolist() == outcome.weight.tolist() == [1.0, 0.0, whole]
     assert decision.lost.tolist() == [0.0, 1.0, 0.0]
     assert (decision.region[0], decision.next_region[0], after.clock[0]) == (0, 1, (clock + 2) % 6)
+    assert (decision.goal == 7).all()  # where it was when the target was chosen, not at 5
     left = 6 - clock - 1
     expected = {"success": (1 + left) / 6, "mean": so_far - 3 / 6 - left * 3 / 6, "max": -3.0}[reward]
     np.testing.assert_allclose(decision.reward[0], expected, rtol=1e-6)

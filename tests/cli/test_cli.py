@@ -14,7 +14,7 @@ from star.agent import exam_tables, exams
 from star.agent.sections import Config
 from star.cli import main
 from star.cli.words import split_settings
-from star.config import described
+from star.config import agents, described
 from star.config.loading import fields
 from star.training import trainer
 from tests.cli.refused import refusal
@@ -34,7 +34,7 @@ def calls(monkeypatch):
 
     def evaluate(targets, exam, *, quiet):
         calls.append({"targets": targets, "exam": exam, "config": targets[0].config})
-        return [evaluation(str(target.run_dir), env_steps=10) for target in targets]
+        return [evaluation(agents.told(target.run_dir), env_steps=10) for target in targets]
 
     monkeypatch.setattr(trainer, "train", train)
     monkeypatch.setattr(exams, "evaluate", evaluate)
@@ -223,6 +223,19 @@ def test_evaluate_compares_groups_of_runs_and_each_other_run_by_itself(calls, fo
     assert "eval/evaluation.jsonl: exists" in refusal(capsys, folder, "evaluate runs/old --out eval".split())
     assert main("evaluate runs/old --out eval --force --quiet".split()) == 0
     assert {path.name for path in (folder / "eval").iterdir()} == {"evaluation.jsonl"}
+
+
+def test_agents_of_the_package_are_compared_by_their_names(calls, capsys):
+    assert main("evaluate ant_maze runs/old --group ours=point_maze --json".split()) == 0
+    comparison = json.loads(capsys.readouterr().out.splitlines()[-1])
+    found = {group["name"]: group["runs"] for group in comparison["groups"]}
+    assert found == {"ours": ["point_maze"], "ant_maze": ["ant_maze"], "runs/old": ["runs/old"]}
+
+
+def test_files_about_an_agent_of_the_package_need_a_folder(calls, capsys, folder):
+    command = "evaluate point_maze --goals grid --grid 2".split()
+    assert "point_maze has no folder for them; add --out DIR" in refusal(capsys, folder, command)
+    assert main([*command, "--out", "seen"]) == 0 and (folder / "seen" / "evaluation.jsonl").exists()
 
 
 def test_evaluate_takes_the_engine_of_this_machine(calls, folder):

@@ -13,7 +13,7 @@ import yaml
 from star.cli import main
 from star.config import shipped
 from star.config.loading import load, parse
-from tests.small import RUN
+from tests.small import ALONE, RUN
 
 ROOT = Path(__file__).parents[2]
 
@@ -98,6 +98,15 @@ def test_a_dry_run_says_how_often_a_level_learns_from_what_is_new(folder, capsys
     assert main(["train", "run.yaml", "--dry-run", *td3.split()]) == 0
     assert "# tutor: 5 samples per new transition\n" in (out := capsys.readouterr().out)  # 4 * 30 for 2 * 12
     assert "controller: " not in out
+
+
+def test_a_dry_run_says_which_settings_a_learner_without_reward_ignores(folder, capsys):
+    control = {"learner": "crl", "frame": "map", "termination_penalty": 8.0, "crl": {"min_transitions": 100}}
+    (folder / "run.yaml").write_text(json.dumps(ALONE | {"controller": control, "env": {"name": "point_u_maze"}}))
+    assert main(["train", "run.yaml", "--dry-run"]) == 0
+    assert "# controller.learner crl sees no reward; without effect: termination_penalty\n" in capsys.readouterr().out
+    assert main(["train", "run.yaml", "--dry-run", "--controller.termination_penalty", "20"]) == 0
+    assert "sees no reward" not in capsys.readouterr().out
 
 
 def test_a_dry_run_says_where_the_goal_of_a_map_is_that_marks_none(folder, capsys):

@@ -126,6 +126,14 @@ def test_samples_of_weight_0_have_no_influence(start, update):
     assert any((a != b).any() for a, b in zip(*map(jax.tree.leaves, (first.params, start.params)), strict=True))
 
 
+def test_from_a_rollout_without_weight_nothing_is_learnt(start, update):
+    learnt, _ = update(settings(), start, random_rollout(), jax.random.key(1))
+    empty = random_rollout(1).replace(weight=np.zeros((T, B), np.float32))
+    same, metrics = update(settings(), learnt, empty, jax.random.key(2))
+    jax.tree.map(np.testing.assert_array_equal, same, learnt)
+    assert float(metrics["learning_rate"]) == float(learnt.learning_rate)
+
+
 def test_what_has_weight_0_may_become_infinitely_unlikely(start, update):
     rollout = random_rollout()
     weight = np.ones((T, B), np.float32)

@@ -1,11 +1,12 @@
 import errno
 import fcntl
 import os
+import threading
 
 import pytest
 
 from envs.common.errors import UserError
-from star.training.lock import locked
+from star.training.lock import held, locked
 
 
 def unexpected(line):
@@ -19,6 +20,16 @@ def test_a_run_directory_in_use_is_refused_with_the_name_of_who_uses_it(tmp_path
                 raise AssertionError
     with locked(tmp_path, warn=unexpected):
         pass
+
+
+def test_who_only_looks_does_not_keep_a_run_from_beginning(tmp_path):
+    (tmp_path / ".lock").touch()
+    with (tmp_path / ".lock").open() as looking:
+        fcntl.flock(looking, fcntl.LOCK_SH)
+        threading.Timer(0.03, fcntl.flock, (looking, fcntl.LOCK_UN)).start()
+        with locked(tmp_path, warn=unexpected):
+            assert held(tmp_path)
+    assert not held(tmp_path)
 
 
 def test_a_file_system_that_cannot_lock_is_told_of_and_used_all_the_same(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 from tensorboardX.proto.event_pb2 import Event
 
+from envs.common import files
 from envs.common.errors import UserError
 from star.config.loading import parse
 from star.training import sinks
@@ -144,6 +145,17 @@ def test_an_offline_run_of_wandb_goes_on_as_the_same_run_and_tells_nothing_twice
         summary |= values(record.summary.update)
     assert summary["train/return"] == 6.0 and summary["env_steps"] == 30
     assert len(list(run_dir.glob("wandb/offline-*/files/media/images/figures/summary*.png"))) == 2
+
+
+def test_what_wandb_remembers_is_whole_after_a_full_disk(tmp_path, monkeypatch):
+    sink = object.__new__(WandB)
+    sink._memory, sink._id, sink._told = tmp_path / "star.json", "abc", 10
+    sink._remember()
+    sink._told = 20
+    monkeypatch.setattr(files, "sync", failing)
+    with pytest.raises(UserError, match="star.json: cannot be written"):
+        sink._remember()
+    assert json.loads(sink._memory.read_text()) == {"id": "abc", "env_steps": 10}
 
 
 class Stuck:
