@@ -1,4 +1,4 @@
-"""Whether STAR is ahead of other agents on the ant tasks, by Welch's intervals."""
+"""STAR beside other agents on the ant tasks: who is ahead, by Welch's intervals."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ AGENTS = {"STAR": "star", "GARA": "gara", "HIRO": "hiro", "HRAC": "hrac", "flat"
 
 
 class Verdict(NamedTuple):
-    """Whether STAR is ahead of an agent in a task, by Welch's interval of the difference in success."""
+    """STAR beside an agent in a task, by Welch's interval of the difference in success."""
 
     agent: str
     task: str
