@@ -124,13 +124,20 @@ def relu(z: Zonotope) -> Zonotope:
     )
 
 
+def hull(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) -> tuple[Array, Array]:
+    """Box that contains the image of the box [lower, upper] under `network`."""
+    return pushed(network, lower, upper)[0]
+
+
+def smear(network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]) -> Float[Array, "n"]:
+    """Per input: the sum over outputs of the largest |derivative| in the box, times the box's half-width there."""
+    return pushed(network, lower, upper)[1]
+
+
 def pushed(
     network: Network, lower: Float[Array, "n"], upper: Float[Array, "n"]
 ) -> tuple[tuple[Array, Array], Float[Array, "n"]]:
-    """A box that contains the image of the box [lower, upper] under `network`, and the smear of each input.
-
-    A smear is the sum over outputs of the largest |derivative| in the box, times the box's half-width there.
-    """
+    """`hull` and `smear` of the box [lower, upper], by one way through `network`."""
     layers, box = network.layers, from_box(lower, upper)
     z = network.affine(0, box)
     low, high = layers[0][0], layers[0][0]

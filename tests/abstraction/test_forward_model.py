@@ -15,7 +15,7 @@ SPACE = np.float32([[-4.0, 0.0], [20.0, 10.0]])
 
 # Compiled once, not each time that a test calls them.
 predict, errors = jax.jit(forward_model.predict), jax.jit(forward_model.errors)
-hulls = jax.jit(jax.vmap(lambda *box: reachability.pushed(*box)[0], in_axes=(None, 0, 0)))
+hulls = jax.jit(jax.vmap(reachability.hull, in_axes=(None, 0, 0)))
 
 
 @cache

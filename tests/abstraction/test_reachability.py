@@ -22,7 +22,7 @@ def f32(*arrays):
 
 
 # Compiled once, not each time that a test calls them.
-shares, pushed, summary = (jax.jit(one) for one in (reachability.shares, reachability.pushed, reachability.summary))
+shares, smear, summary = (jax.jit(one) for one in (reachability.shares, reachability.smear, reachability.summary))
 judge, reaches_where_visited = jax.jit(reachability.judge), jax.jit(reachability.reaches_where_visited)
 
 
@@ -100,9 +100,9 @@ def test_smear_of_a_linear_map_is_exact():
     weight = np.array([[1.0, -2.0], [3.0, 0.5]])
     lower, upper = f32((0.0, 1.0), (2.0, 4.0))
     network = Network(layers=(f32(weight, np.zeros(2)),))
-    np.testing.assert_allclose(pushed(network, lower, upper)[1], [4.0 * 1.0, 2.5 * 1.5], rtol=1e-6)
+    np.testing.assert_allclose(smear(network, lower, upper), [4.0 * 1.0, 2.5 * 1.5], rtol=1e-6)
     residual = network.replace(residual=True)
-    np.testing.assert_allclose(pushed(residual, lower, upper)[1], [5.0 * 1.0, 3.5 * 1.5], rtol=1e-6)
+    np.testing.assert_allclose(smear(residual, lower, upper), [5.0 * 1.0, 3.5 * 1.5], rtol=1e-6)
 
 
 def test_an_unknown_part_is_halved_along_its_largest_smear():
