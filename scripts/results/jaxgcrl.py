@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from scripts.pages import charts
-from scripts.results.rows import Row
+from scripts.results.rows import Row, evaluations
 from star.report import statistics
-from star.training.journal import JsonLines
 
 MAZES = {"big maze": "jaxgcrl/ant_big_maze", "hardest maze": "jaxgcrl/ant_hardest_maze"}
 AGENTS = {"STAR": "one_by_one/star", "STAR, frugal": "frugal", "CRL": "crl", "ChronoSRL": "chronosrl"}
@@ -89,8 +87,3 @@ def curves(results: Path) -> Figure:
     axes[-1, 1].set_xlabel("seconds, with compilation and evaluations")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center")
     return figure
-
-
-def evaluations(row: Path) -> list[dict[str, Any]]:
-    """All evaluations in training of the row at `row`, a path without ending."""
-    return [point for point in JsonLines(row.parent / "curves.jsonl").read() if point["name"] == row.name]

@@ -24,9 +24,8 @@ from matplotlib.figure import Figure
 
 from scripts.pages import charts
 from scripts.results import digest, jaxgcrl
-from scripts.results.rows import DIGESTS, MARK, RESULTS, Row, read
+from scripts.results.rows import DIGESTS, MARK, RESULTS, Row, evaluations, read
 from scripts.results.verdicts import AGENTS, FOLDERS, standing, unmeasured, verdicts
-from star.training.journal import JsonLines
 
 ROOT = Path(__file__).parents[2]
 BEGIN, END = "<!-- made by scripts/results/page.py -->", "<!-- made until here -->"
@@ -131,7 +130,7 @@ def page(rows: Mapping[str, Row]) -> str:
 
 {standing(found)}
 
-`python scripts/results/page.py` makes this page from the JSON files in `results/`. {_age(older, len(shown))}
+Made from `results/`. {_age(older, len(shown))}
 
 ## Success and time
 
@@ -223,9 +222,8 @@ def curves(results: Path) -> Figure:
     figure = Figure(figsize=(8.2, 2.6), layout="constrained")
     axes = figure.subplots(1, len(FOLDERS), sharey=True)
     for axis, (task, folder) in zip(axes, FOLDERS.items(), strict=True):
-        points = JsonLines(results / folder / "curves.jsonl").read()
         for number, (label, name) in enumerate(list(AGENTS.items())[:2]):
-            mine = [point for point in points if point["name"] == name]
+            mine = evaluations(results / folder / name)
             charts.band(axis, mine, "eval/success_any", color=f"C{number}", label=label)
         axis.set(title=task, ylim=(-0.02, 1.02))
     axes[0].set_ylabel("success")
@@ -253,11 +251,9 @@ def sources(rows: Mapping[str, Row], results: Path = RESULTS) -> str:
     """A hash of all figures that the charts show; each chart carries it."""
     shown = {path: list(map(float, rows[path].scores)) for paths in charted(rows).values() for path in paths}
     told = hashlib.sha256(json.dumps(shown, sort_keys=True).encode())
-    for folder in FOLDERS.values():
-        points = JsonLines(results / folder / "curves.jsonl").read()
-        told.update(json.dumps([p for p in points if p["name"] in list(AGENTS.values())[:2]]).encode())
-    for path in jaxgcrl.paths(rows):
-        told.update(json.dumps(jaxgcrl.evaluations(results / path)).encode())
+    drawn = [f"{folder}/{name}" for folder in FOLDERS.values() for name in list(AGENTS.values())[:2]]
+    for path in drawn + jaxgcrl.paths(rows):
+        told.update(json.dumps(evaluations(results / path)).encode())
     return told.hexdigest()[:16]
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from scripts.results import digest
 from star.report import statistics
+from star.training.journal import JsonLines
 
 RESULTS = Path(__file__).parents[2] / "results"
 DIGESTS = RESULTS / "digests.json"
@@ -53,3 +54,8 @@ def read(results: Path = RESULTS) -> dict[str, Row]:
             same = (digest.same(run.get("digest"), today.get(name)) for run in report["runs"])
             rows[name] = Row(name, report, all(same))
     return rows
+
+
+def evaluations(row: Path) -> list[dict[str, Any]]:
+    """All evaluations in training of the row at `row`, a path without ending."""
+    return [point for point in JsonLines(row.parent / "curves.jsonl").read() if point["name"] == row.name]

@@ -54,8 +54,7 @@ class Decision(struct.PyTreeNode):
 
     `weight` is 1 where the period really lasted k env steps, `lost` is 1 where the task was terminated in it,
     `aside` is 1 where what was commanded was a waypoint, which tells nothing of its region, and `shown` is 1 where a
-    teacher chose the target. The reward is that for the goal, which was at the point `goal` when it
-    was chosen.
+    teacher chose the target. The reward is that for the goal, which was at the point `goal` as the target was chosen.
     """
 
     region: Int[Array, "N"]

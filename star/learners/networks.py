@@ -12,6 +12,8 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float
 
+from envs.common.batching import where
+
 VARIANCE = 1 / 3  # of an initial weight, times the inputs of its layer, in JaxGCRL and ChronoSRL
 _LEAST = 1e-6
 
@@ -119,7 +121,7 @@ def adam_step(
     """One Adam step, or nothing at all where `enabled` is false."""
     step, stepped = optax.scale_by_adam().update(gradient, optimizer)
     params = jax.tree.map(lambda p, s: p - jnp.where(enabled, learning_rate * s, 0.0), params, step)
-    return params, jax.tree.map(lambda new, old: jnp.where(enabled, new, old), stepped, optimizer)
+    return params, where(enabled, stepped, optimizer)
 
 
 class Normalizer(struct.PyTreeNode):

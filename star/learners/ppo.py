@@ -26,6 +26,7 @@ from flax import struct
 from flax.linen import elu
 from jaxtyping import Array, Float
 
+from envs.common.batching import where
 from star import devices
 from star.learners.networks import MLP, Normalizer, apply
 from star.learners.protocol import Learner
@@ -179,8 +180,7 @@ def update(
         returns=returns,
         learning_rate=learning_rate,
     )
-    something = rollout.weight.sum() > 0
-    state = jax.tree.map(lambda new, old: jnp.where(something, new, old), learnt, state)
+    state = where(rollout.weight.sum() > 0, learnt, state)
     metrics = jax.tree.map(jnp.mean, metrics) | {
         "learning_rate": state.learning_rate,
         "std": jnp.exp(state.params["log_std"]).mean(),
