@@ -193,7 +193,8 @@ def _from_yaml(text: str, cell: float, *, name: str) -> Arena:
         values = reading.plain(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        raise EnvError(f"{name}: is not YAML" + (f", line {mark.line + 1}" if mark else "")) from None
+        where = f", line {mark.line + 1}" if mark else ""
+        raise EnvError(f"{name}: is not YAML{where}: {reading.problem(error)}") from None
     if not isinstance(values, dict) or not isinstance(values.get("map"), str):
         raise EnvError(f'{name}: needs the rows as a block of text: "map: |", then one line for each row')
     given: dict[Any, Any] = {"cell": cell, "block": "xy"} | values

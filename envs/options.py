@@ -151,7 +151,7 @@ def made(name: str, factory: Callable[..., Any], given: Mapping[str, Any]) -> An
         return factory(**given)
     except UserError as error:
         raise EnvError(f"{name}: {error}") from None
-    except Exception as error:  # whatever its author has done
+    except (Exception, SystemExit) as error:  # whatever its author has done
         raise EnvError(f"{name}: raises {where_raised(error)}") from error
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from envs.common.errors import UserError
+from envs.common.errors import UserError, shown
 from envs.common.files import given_back, new_place
 from star.config import agents, kinds
 from star.config.loading import experiment_of, kind_of, load_to_act, parse
@@ -80,7 +80,7 @@ def evaluate(
     """
     if checkpoint == "all":
         raise UserError("checkpoint: 'all' is not allowed: should be last, best or env steps")
-    run_dir = agents.find(Path(run))
+    run_dir = agents.find(_path(run))
     measure = kind_of(run_dir).commands.get("measure", _measure)
     (row,) = measure(run_dir, settings or {}, checkpoint=str(checkpoint), seed=seed)
     return row
@@ -97,7 +97,7 @@ def load(run: str | Path, *, checkpoint: str | int = "last", seed: int | None = 
     Raises:
       UserError: in one line, if there is no such run or checkpoint, or its experiment has no agent that acts.
     """
-    run_dir = agents.find(Path(run))
+    run_dir = agents.find(_path(run))
     commands = kind_of(run_dir).commands
     if "load" not in commands:
         name = experiment_of(run_dir)
@@ -107,12 +107,24 @@ def load(run: str | Path, *, checkpoint: str | int = "last", seed: int | None = 
 
 def _config(config: Any, settings: Mapping[str, Any], layers: Sequence[str | Path]) -> RunConfig:
     """The validated settings of a run."""
+    for what, given in (("config", config), ("settings", settings)):
+        named = isinstance(given, Mapping) and all(isinstance(key, str) for key in given)
+        if not (named or (what == "config" and isinstance(given, str | Path | RunConfig))):
+            words = "a name, a file, or a mapping of sections" if what == "config" else "a mapping of dotted keys"
+            raise UserError(f"{what}: {shown(given)} is not allowed: should be {words}")
     if isinstance(config, str | Path):
         return load_config(config, settings, layers=layers, typed=_SETTINGS)
     if layers:
         raise UserError("layers: need a config that is a name or a file")
     values = config.model_dump(mode="json") if isinstance(config, RunConfig) else config
     return parse(values, settings, typed=_SETTINGS)
+
+
+def _path(run: Any) -> Path:
+    """The folder or name of a run."""
+    if not isinstance(run, str | Path):
+        raise UserError(f"run: {shown(run)} is not allowed: should be the folder of a run, or the name of an agent")
+    return Path(run)
 
 
 def _name(config: Any, layers: Sequence[str | Path], kind: kinds.Kind, resolved: RunConfig) -> str:

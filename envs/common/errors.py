@@ -33,7 +33,7 @@ def shown(value: Any, limit: int = 60) -> str:
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
-def where_raised(error: Exception) -> str:
+def where_raised(error: BaseException) -> str:
     """An error in one line: its kind, the first line of what it says, and where its author's own code raised it."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if _is_authors(Path(frame.filename))]
     place = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""

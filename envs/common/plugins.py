@@ -15,6 +15,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -56,7 +57,7 @@ def find(name: str, kind: type[Kind]) -> Kind:
     _look_here_too()
     try:
         holder = importlib.import_module(module)
-    except Exception as error:  # whatever its author has done
+    except (Exception, SystemExit) as error:  # whatever its author has done
         raise UserError(f"cannot be imported: {where_raised(error)}") from None
     found = getattr(holder, attribute, None)
     if found is None or not isinstance(found, kind):
@@ -86,6 +87,31 @@ def find_function(name: str, *, makes: str) -> Callable[..., Any]:
     except (TypeError, ValueError):  # no function, or one in C
         raise UserError(f"{name}: is a {type(found).__name__}; allowed: a function that makes {makes}") from None
     return found
+
+
+class Guarded:
+    """A value of a user's own: an error in one of its parts becomes one line, a `UserError` that begins with `name`."""
+
+    def __init__(self, value: Any, name: str) -> None:
+        self._value, self._name = value, name
+
+    def __getattr__(self, part: str) -> Any:
+        """The same part of the value; a function of it is guarded, too."""
+        if part.startswith("__"):
+            raise AttributeError(part)
+        found = self._called(part, getattr, self._value, part)
+        if not callable(found) or isinstance(found, type):
+            return found
+        return wraps(found)(partial(self._called, part, found))
+
+    def _called(self, part: str, function: Callable[..., Any], *args: Any, **more: Any) -> Any:
+        """Call the function, which errors call `part`."""
+        try:
+            return function(*args, **more)
+        except (Exception, SystemExit) as error:  # whatever its author has done
+            if isinstance(error, UserError) or (function is getattr and isinstance(error, AttributeError)):
+                raise
+            raise UserError(f"{self._name}: {part} raises {where_raised(error)}") from error
 
 
 def takes(function: Callable[..., Any], option: str) -> bool:

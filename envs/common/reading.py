@@ -46,7 +46,7 @@ def text(path: Path) -> str:
 def plain(text: str) -> Any:
     """The values of the YAML document `text`: dictionaries, lists, text, numbers and bytes.
 
-    Numbers are those of YAML 1.2: `010` is ten and `1e-4` is a number, `1:30` and `2024-01-02` are text.
+    They are those of YAML 1.2: `010` is ten and `1e-4` is a number, `1:30`, `2024-01-02` and `yes` are text.
 
     Raises:
       yaml.YAMLError: also for a key given twice, and for what is nested too deep or grows too large by its aliases.
@@ -98,13 +98,15 @@ _FLOAT = (
         r"[-+]?(?:(?:[0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)(?:[eE][-+]?[0-9]+)?|\.(?:inf|Inf|INF))$|\.(?:nan|NaN|NAN)$"
     ),
 )
-_OLD = (_INTEGER[0], _FLOAT[0], "tag:yaml.org,2002:timestamp")
+_BOOLEAN = ("tag:yaml.org,2002:bool", re.compile(r"true|True|TRUE|false|False|FALSE"))
+_OLD = (_INTEGER[0], _FLOAT[0], _BOOLEAN[0], "tag:yaml.org,2002:timestamp")
 _Plain.yaml_implicit_resolvers = {
     first: [(tag, pattern) for tag, pattern in resolvers if tag not in _OLD]
     for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
 }
 for _tag, _pattern in (_INTEGER, _FLOAT):
     _Plain.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
+_Plain.add_implicit_resolver(_BOOLEAN[0], _BOOLEAN[1], list("tTfF"))
 
 
 class _Writer(yaml.SafeDumper):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from star.config.section import Batch, Hidden, Positive, Repeats, Section, setting
 from star.learners.sections import BufferedConfig
@@ -28,6 +28,12 @@ class AbstractionConfig(Section):
         unit="regions",
     )
     min_width: float = setting(1.0, "No region is cut narrower than this.", unit="units of the state", gt=0)
+
+    @model_validator(mode="after")
+    def _cut_in_one_way(self) -> Self:
+        if self.grid is not None and self.cuts is not None:
+            raise ValueError(f"grid: {list(self.grid)}, but there are cuts, too; allowed: one of them")
+        return self
 
 
 class ForwardModelConfig(BufferedConfig):

@@ -12,6 +12,7 @@ from typing import Any
 import envs
 from envs import goal_env
 from envs.common import plugins
+from envs.common.errors import shown
 from envs.options import made
 from star.agent.sections import Config
 from star.config.section import ConfigError
@@ -26,6 +27,9 @@ def make(config: Config, goals: str, **others: Any) -> Any:
       UserError: in one line, if it cannot be had.
     """
     name, engine, options = config.env.name, config.env.engine, options_of(config, goals) | others
+    for key in ("engine",) if plugins.is_plugin(name) else ("engine", "name"):
+        if key in options:
+            raise ConfigError(f"env: option {key} ({shown(options[key])}) stands beside the options, as env.{key}")
     try:
         if not plugins.is_plugin(name):
             return envs.make(name, engine=engine, **options)

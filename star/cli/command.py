@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from envs.common import modes, plugins
-from envs.common.errors import Notice, UserError
+from envs.common.errors import Notice, UserError, shown
 from star import __version__
 from star.cli import (
     completion,
@@ -180,6 +180,9 @@ def _run(arguments: list[str]) -> int:
     for name in (*getattr(options, "modules", []), *filter(plugins.is_plugin, typed)):
         plugins.trust(name.partition(":")[0])
     flags = {name: value(text) for name, text in vars(options).items() if "." in name and text is not None}
+    for key in flags.keys() & overrides.keys():
+        if flags[key] != overrides[key]:
+            raise ConfigError(f"{key}: is given twice, as {shown(overrides[key])} and {shown(flags[key])}")
     return options.function(options, flags | overrides)
 
 

@@ -258,6 +258,9 @@ _PLAIN = {
     r"a valid integer(, (unable to parse.*|got a number with a fractional part))?": "a whole number",
     r"[Uu]nable to parse input string as an integer, exceeded maximum size": "should be a smaller whole number",
     r"a valid number(, unable to parse.*)?": "a number",
+    r"[Ii]nput is not a valid path for .*": "should be the name of a file",
+    r"[Dd]ictionary should have at least 1 item.*": "should name at least one",
+    r"[Tt]uple should have at least 1 item.*": "should have at least one",
     "greater than or equal to": "at least",
     "less than or equal to": "at most",
 }  # pydantic's words (regular expressions), and what users of YAML say

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import types
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import jax
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic_core import PydanticKnownError
 
 from envs.common.errors import UserError
 
@@ -19,17 +21,20 @@ _LARGEST = 3.4e38  # of float32, in round numbers
 _SMALLEST = 1.2e-38
 
 
-class Section(BaseModel):
-    """A frozen group of settings that refuses unknown keys and is a JAX pytree with its floats as leaves."""
+class Group(BaseModel):
+    """A frozen group of values that refuses unknown keys, and values of another type: `"1"` is text, 1 is not true."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
-    def _refuse_booleans_as_numbers(cls, value: Any, info: ValidationInfo) -> Any:
-        if isinstance(value, bool) and cls.model_fields[str(info.field_name)].annotation in (int, float):
-            raise ValueError("should be a number")
+    def _refuse_other_types(cls, value: Any, info: ValidationInfo) -> Any:
+        _check_type(value, cls.model_fields[str(info.field_name)].annotation)
         return value
+
+
+class Section(Group):
+    """A group of settings that is a JAX pytree with its floats as leaves."""
 
     @field_validator("*", mode="after")
     @classmethod
@@ -57,6 +62,53 @@ def setting(default: Any, about: str, *, unit: str | None = None, allowed: str |
       checks: as of pydantic's `Field`, such as `gt=0`. Types tell more: `Literal`, `Positive`.
     """
     return Field(default, description=about, json_schema_extra={"unit": unit, "allowed": allowed}, **checks)
+
+
+def _check_type(value: Any, annotation: Any) -> None:
+    """Raise pydantic's error for a number, text or boolean that pydantic would make another of; see YAML 1.2."""
+    parts = get_args(annotation)
+    if get_origin(annotation) in (Union, types.UnionType) and isinstance(value, list | tuple):
+        for one in parts:
+            _check_type(value, one)
+    if get_origin(annotation) is tuple and isinstance(value, list | tuple):
+        for one in value:
+            _check_type(one, parts[0])
+    elif get_origin(annotation) is tuple and get_origin(parts[0]) is Literal:
+        raise ValueError(f"should be a list of {' or '.join(map(repr, get_args(parts[0])))}")
+    allowed = _scalars(annotation)
+    if type(value) not in (bool, int, float, str) or not allowed or type(value) in allowed:
+        return
+    if allowed & {int, float} and (type(value) in (int, float) or not _is_number(value)):
+        return  # pydantic says it better
+    literal = next((one for one in (annotation, *parts) if get_origin(one) is Literal), None)
+    if literal is not None:
+        *first, last = map(repr, get_args(literal))
+        raise PydanticKnownError("literal_error", {"expected": " or ".join(filter(None, [", ".join(first), last]))})
+    kind = next(one for one in ("bool", "int", "float", "string") if one in {_NAMES[each] for each in allowed})
+    raise PydanticKnownError(f"{kind}_type")  # type: ignore[arg-type]
+
+
+def _is_number(value: Any) -> bool:
+    """True if Python makes a number of it."""
+    try:
+        return bool(float(value)) or True
+    except ValueError:
+        return False
+
+
+_NAMES = {bool: "bool", int: "int", float: "float", str: "string"}
+
+
+def _scalars(annotation: Any) -> set[type]:
+    """The types of numbers, text and booleans that an annotation allows; none if it may be anything else than null."""
+    if get_origin(annotation) is Annotated:
+        return _scalars(get_args(annotation)[0])
+    if get_origin(annotation) is Literal:
+        return {type(one) for one in get_args(annotation)}
+    if get_origin(annotation) in (Union, types.UnionType):
+        found = [_scalars(one) for one in get_args(annotation) if one is not type(None)]
+        return set().union(*found) if all(found) else set()
+    return {annotation} if annotation in _NAMES else set()
 
 
 def _is_leaf_field(cls: type[Section], name: str) -> bool:

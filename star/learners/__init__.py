@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from envs.common import plugins
+from star.learners import own
 from star.learners.protocol import WHOLE, Learner, LearnerConfig, Rollout
 from star.learners.sections import LevelConfig
 
@@ -29,7 +30,7 @@ __all__ = ["WHOLE", "Learner", "LearnerConfig", "Rollout", "act", "find", "init"
 def find(name: str) -> Learner:
     """The learner of this name."""
     if plugins.is_plugin(name):
-        return plugins.find(name, Learner)
+        return own.find(name)
     return importlib.import_module(f"star.learners.{name}").LEARNER
 
 

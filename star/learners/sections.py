@@ -277,4 +277,7 @@ class LevelConfig(Section):
 
 def _own(name: str) -> type[LearnerConfig]:
     """The type of the settings of a learner from outside; ValueError in one line if it cannot be had."""
-    return plugins.find(name, Learner).Config
+    found = plugins.find(name, Learner).Config
+    if not (isinstance(found, type) and issubclass(found, LearnerConfig)):
+        raise ValueError(f"its Config is {shown(found)}; allowed: a subclass of star.learners.LearnerConfig")
+    return found

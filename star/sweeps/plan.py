@@ -10,25 +10,21 @@ from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from envs.common.errors import shown
 from star.config import kinds, shipped
 from star.config.kinds import Kind, Measure
 from star.config.loading import check_setting, explain, first_of, flat, load, parse, read_file, type_of
 from star.config.run import RunConfig
-from star.config.section import ConfigError, Positive
+from star.config.section import ConfigError, Group, Positive
 from star.sweeps.ledger import product
 from star.training import program as programs
 
 _MAX_GRID = 100_000  # points
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Parameter(_Model):
+class Parameter(Group):
     """The values of one setting that are tried: `choices`, or a range. A list is short for choices."""
 
     choices: tuple[Any, ...] | None = Field(None, description="values to choose from")
@@ -57,20 +53,13 @@ class Parameter(_Model):
             raise ValueError("log and step exclude one another")
         return self
 
-    def as_numbers(self) -> Parameter:
-        """With choices like "1e-3" as the number they say."""
-        try:
-            return self.model_copy(update={"choices": self.choices and tuple(float(one) for one in self.choices)})
-        except (TypeError, ValueError):  # said better by the setting itself
-            return self
-
     @property
     def ends(self) -> tuple[Any, ...]:
         """The values whose validity implies that of all others: all choices, or both ends of the range."""
         return (self.low, self.high) if self.choices is None else self.choices
 
 
-class Sweep(_Model):
+class Sweep(Group):
     """A sweep file."""
 
     config: Path = Field(description="config file of all trials, from the folder of this file")
@@ -93,18 +82,14 @@ class Sweep(_Model):
             return value
         return {key: {"choices": one} if isinstance(one, list) else one for key, one in value.items()}
 
-    def checked(self, model: type[RunConfig]) -> Sweep:
-        """With numbers that YAML reads as text, such as 1e-3, as numbers; raises ValueError if the sampler cannot."""
-        parameters = {
-            key: one.as_numbers() if type_of(key, model) is float else one for key, one in self.parameters.items()
-        }
-        ranges = [key for key, one in parameters.items() if one.choices is None]
-        for key in ranges:
-            if self.sampler == "grid" and (type_of(key, model) is not int or parameters[key].log):
+    def check(self, model: type[RunConfig]) -> None:
+        """Raise ValueError in one line if the sampler cannot choose among these values."""
+        ranges = {key: one for key, one in self.parameters.items() if one.choices is None}
+        for key, one in ranges.items():
+            if self.sampler == "grid" and (type_of(key, model) is not int or one.log):
                 raise ValueError(f"parameters.{key}: sampler grid needs choices, or a range of whole numbers")
-        if self.sampler == "cmaes" and (len(ranges) < 2 or len(ranges) < len(parameters)):
+        if self.sampler == "cmaes" and (len(ranges) < 2 or len(ranges) < len(self.parameters)):
             raise ValueError("sampler: cmaes needs two or more parameters, all with low and high")
-        return self.model_copy(update={"parameters": parameters})
 
 
 @dataclass(frozen=True)
@@ -186,7 +171,7 @@ def plan(path: Path, *, settings: Mapping[str, Any] | None = None, **changes: An
     )
     base = parse(base.model_dump(mode="json"), settings, source=str(path))
     try:
-        sweep = sweep.checked(type(base))
+        sweep.check(type(base))
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from None
     names = [measure.name for measure in kinds.of(base).measures]

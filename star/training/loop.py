@@ -177,6 +177,9 @@ class Loop:
         if first:
             self._program.prepare()
         state, metrics = self._program.epoch(state)
+        if first and (counted := int(jax.device_get(state.epoch)[0])) != self._done + 1:
+            name = self._program.config.experiment
+            raise ConfigError(f"experiment: {name}: `epoch` is {counted} after epoch {self._done + 1}; it must add 1")
         return state, of_epoch(metrics, self._program.seeds)
 
     def _evaluate(self, state: Any) -> Any:

@@ -16,15 +16,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from envs.common import extras, modes
+from envs.common import extras, modes, plugins
 from envs.common.errors import UserError
 from star import devices
 from star.config import kinds
 from star.config.kinds import Kind
 from star.config.run import RunConfig
 from star.config.section import ConfigError
-from star.training import faults
-from star.training.experiment import PARTS
+from star.training import faults, own
 
 # Streams of random keys that no seed of training uses.
 DURING_TRAINING = 2**32 - 1
@@ -75,6 +74,12 @@ class Program:
     def evaluate(self, state: Any, keys: jax.Array) -> Any:
         """The experiment's evaluation of each state, such as greedy episodes on test goals."""
         return self.functions.evaluate(self.hyper, state, keys)
+
+    def check(self) -> None:
+        """Trace an epoch and the evaluation, as before they are compiled; raises `UserError` for a user's mistake."""
+        state = self.example()
+        jax.eval_shape(self.functions.epoch, self.hyper, self.data(), state)
+        jax.eval_shape(self.functions.evaluate, self.hyper, state, self.evaluation_keys(0))
 
     def prepare(self) -> None:
         """Compile an epoch and the evaluation side by side; errors are left to each one's first use.
@@ -135,16 +140,11 @@ def build(config: RunConfig) -> Program:
     select_device(config.trainer.device)
     modes.check_training()
     kind = kinds.of(config)
-    experiment = kind.build(config)
-    for part in PARTS:
-        if not hasattr(experiment, part):
-            raise ConfigError(f"experiment: {config.experiment}: has no {part}; all have {', '.join(PARTS)}")
+    experiment = own.build(kind, config) if plugins.is_plugin(config.experiment) else kind.build(config)
     hyper = experiment.config.hyper()
     mesh = devices.mesh(config.trainer.devices)
     everywhere = devices.everywhere(mesh)
     shapes = jax.eval_shape(experiment.init, hyper, seed_keys([0]))
-    if not hasattr(shapes, "epoch"):
-        raise ConfigError(f"experiment: {config.experiment}: its state has no `epoch`, which counts them from 0 on")
     placement = experiment.placement(shapes, mesh, jax.tree.map(lambda _: everywhere, shapes))
 
     def epoch(hyper: Any, data: Any, state: Any) -> Any:

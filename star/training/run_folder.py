@@ -25,10 +25,12 @@ _BEGUN = (lock.NAME, ".config-")  # of a run that was killed before its config.y
 def make(run_dir: Path) -> None:
     """Make the folder of a new run; what a process that was killed at once left there does no harm."""
     try:
-        used = run_dir.is_dir() and any(not entry.name.startswith(_BEGUN) for entry in run_dir.iterdir())
-        if used or (run_dir.exists() and not run_dir.is_dir()):
-            again = command_line.of("train", "--resume", run_dir)
-            raise ConfigError(f"{run_dir}: is not empty; choose another --run-dir, or go on with it: {again}")
+        if run_dir.exists() and not run_dir.is_dir():
+            raise ConfigError(f"{run_dir}: is a file; choose another --run-dir")
+        if run_dir.is_dir() and any(not entry.name.startswith(_BEGUN) for entry in run_dir.iterdir()):
+            run = (run_dir / "config.yaml").is_file()
+            again = f", or go on with it: {command_line.of('train', '--resume', run_dir)}" if run else ""
+            raise ConfigError(f"{run_dir}: is not empty; choose another --run-dir{again}")
         devices.wait("the run directory is empty")
         run_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:

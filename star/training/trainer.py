@@ -12,6 +12,7 @@ from typing import Any
 import jax
 from rich.console import Console
 
+from envs.common import plugins
 from star import devices
 from star.config.run import RunConfig
 from star.training import memory_budget, profiling, provenance, rollback, run_folder, sinks
@@ -81,6 +82,8 @@ def ready(config: RunConfig, run_dir: Path) -> Program:
     program = programs.build(config)
     program.data()
     memory_budget.check(program)
+    if plugins.trusted():  # a user's own code may be wrong
+        program.check()
     return program
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -239,6 +240,31 @@ def test_no_run_is_told_in_one_line(tmp_path):
     for function in (star.load, star.evaluate):
         with pytest.raises(UserError, match=r"new: is not a run directory, there is nothing of this name$"):
             function(tmp_path / "new")
+
+
+@pytest.mark.parametrize("function", [star.load, star.evaluate])
+@pytest.mark.parametrize("run", [5, None, ["runs"], b"runs"])
+def test_what_names_no_run_is_told_in_one_line(function, run):
+    with pytest.raises(UserError, match=r"^run: .* is not allowed: should be the folder of a run, or the name of an"):
+        function(run)
+
+
+@pytest.mark.parametrize(
+    ("config", "settings", "line"),
+    [
+        ([1], None, "config: [1] is not allowed: should be a name, a file, or a mapping of sections"),
+        (None, None, "config: null is not allowed"),
+        ({3: 2}, None, "config: {3: 2} is not allowed"),
+        ("point_maze", ["trainer.seed"], "settings: ['trainer.seed'] is not allowed: should be a mapping of dotted"),
+        ("point_maze", {3: 2}, "settings: {3: 2} is not allowed"),
+        (b"point_maze", None, "config: b'point_maze' is not allowed"),
+    ],
+)
+def test_settings_that_are_none_are_told_in_one_line(tmp_path, monkeypatch, config, settings, line):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=f"^{re.escape(line)}"):
+        star.train(config, settings)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -149,6 +149,20 @@ def test_a_robot_from_an_xml_stands_in_a_room_from_a_map(trusted):
         environment.make(loading.parse({"env": {"name": "room:make", "engine": "jax"}}), "train")
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "key"),
+    [
+        ("point_maze", {"engine": "jax"}, "engine"),
+        ("point_maze", {"name": "ant_maze"}, "name"),
+        ("room:make", {"engine": "jax"}, "engine"),
+    ],
+)
+@pytest.mark.parametrize("where", ["options", "training"])
+def test_what_stands_beside_the_options_is_none_of_them(trusted, name, options, key, where):
+    with pytest.raises(UserError, match=f"^env: option {key} .* stands beside the options, as env.{key}$"):
+        environment.make(loading.parse({"env": {"name": name, where: options}}), "train")
+
+
 def test_the_angles_of_wheels_stay_within_a_turn_and_all_else_is_as_mujoco_has_it(trusted):
     body = environment.make(config("car:make"), "test").body
     data = body.init(jax.random.key(0), jnp.zeros(2))

@@ -84,6 +84,9 @@ def test_a_run_never_writes_over_another(capsys, folder):
     (folder / "full").mkdir()
     (folder / "full" / "thesis.txt").write_text("ten years of work")
     message = refusal(capsys, folder, "train point.yaml --run-dir full".split())
+    assert "full: is not empty" in message and "--resume" not in message
+    (folder / "full" / "config.yaml").write_text("{}")  # that of a run
+    message = refusal(capsys, folder, "train point.yaml --run-dir full".split())
     assert "full: is not empty" in message and "star train --resume full" in message
 
 

@@ -141,7 +141,7 @@ def test_numbers_must_be_finite(write, key, value):
 @pytest.mark.parametrize("key", ["trainer.num_envs", "trainer.seed", "tutor.reward_scale", "refinement.depth"])
 @pytest.mark.parametrize("value", [True, False])
 def test_booleans_are_not_numbers(key, value):
-    with pytest.raises(UserError, match=rf"{key}: {str(value).lower()} is not allowed: should be a number"):
+    with pytest.raises(UserError, match=rf"{key}: {str(value).lower()} is not allowed: should be a (whole )?number"):
         parse({}, {key: value})
 
 
@@ -279,11 +279,40 @@ def test_overrides_win_over_the_file_at_any_depth(write):
     assert config.env.options == {"episode_length": 100}
 
 
-def test_overrides_may_be_lists_and_text_that_is_a_number():
-    config = parse({}, {"tutor.ppo.hidden": [32, 16], "abstraction.cuts": [[4, 8.5], []], "commander.discount": "1e-3"})
+def test_overrides_may_be_lists_and_whole_numbers_where_others_may_be():
+    config = parse({}, {"tutor.ppo.hidden": [32, 16], "abstraction.cuts": [[4, 8.5], []], "tutor.heading": 1})
     assert config.tutor.ppo.hidden == (32, 16)
     assert config.abstraction.cuts == ((4.0, 8.5), ())
-    assert config.commander.discount == 0.001
+    assert config.tutor.heading == 1.0
+    assert parse({}, {"trainer.seed": 3.0}).trainer.seed == 3
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "line"),
+    [
+        ("trainer.seed", "1", "'1' is not allowed: should be a whole number"),
+        ("commander.discount", "1e-3", "'1e-3' is not allowed: should be a number"),
+        ("tutor.heading", "0.5", "'0.5' is not allowed: should be a number"),
+        ("tutor.ppo.hidden", [64, "32"], "[64, '32'] is not allowed: should be a whole number"),
+        ("abstraction.cuts", [[True], []], "[[True], []] is not allowed: should be a number"),
+        ("tutor.enabled", "yes", "'yes' is not allowed: should be true or false"),
+        ("tutor.enabled", 1, "1 is not allowed: should be true or false"),
+        ("commander.hold", 1, "1 is not allowed: should be false, true or 'region'"),
+        ("commander.hold", "true", "'true' is not allowed: should be false, true or 'region'"),
+        ("env.name", 5, "5 is not allowed: should be a valid string"),
+    ],
+)
+def test_no_value_is_made_one_of_another_type(key, value, line):
+    with pytest.raises(UserError, match=re.escape(f"{key}: {line}")):
+        parse({}, {key: value})
+
+
+@pytest.mark.parametrize("word", ["yes", "no", "on", "off", "Yes", "OFF"])
+def test_files_say_true_and_false_as_yaml_1_2_does(write, word):
+    assert f"tutor.enabled: '{word}' is not allowed: should be true or false" in refusal(
+        write(f"tutor: {{enabled: {word}}}")
+    )
+    assert load(write("tutor: {enabled: False}")).tutor.enabled is False
 
 
 def test_overrides_leave_the_values_they_were_given_alone():

@@ -73,6 +73,15 @@ def lost(self, state, action):
     return Line.step(self, state, action).replace(obs=jnp.full(3, jnp.nan))
 
 
+def unpaid(self, state, action):
+    after = Line.step(self, state, action)
+    return after.replace(reward=jnp.where(action[0] == 0, after.reward, jnp.nan))
+
+
+def leaves(self, rng):
+    raise SystemExit(3)
+
+
 def far(self, rng):
     return self.at(jnp.ones(()), jnp.zeros(()), jnp.asarray(11.0))
 
@@ -117,6 +126,9 @@ WRONG = {
     "a leaf of another type": (changed(step=whole), "step makes pipeline_state[1] int32 []; allowed: float32 []"),
     "a list for a tuple": (changed(step=listed), "step changes the structure of the state"),
     "not a number": (changed(step=lost), "obs of step with an action of zeros is not finite"),
+    "rewards that are none": (changed(step=unpaid), "reward of all 64 steps with random actions is not finite"),
+    "a pair": (changed(step=lambda self, state, action: (state, 0)), "step gives a tuple; allowed: a brax State"),
+    "an exit": (changed(reset=leaves), "reset raises SystemExit: 3 (" + __file__),
     "goals outside": (changed(reset=far), "a goal of reset has 11 in abstract dimension 0; allowed: inside the space"),
     "an error": (changed(reset=broken), "reset raises RuntimeError: no such robot (" + __file__),
 }

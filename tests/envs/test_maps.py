@@ -59,6 +59,7 @@ def test_what_a_body_can_do_nothing_with_is_refused(symbol, bodies):
     ("name", "text", "words"),
     [
         ("a.yaml", "map: [1", ["is not YAML"]),
+        ("a.yaml", "cell: 4\ncell: 5\nmap: |\n  111\n", ["is not YAML, line 2: cell is given twice"]),
         ("a.yaml", "rows: |\n  111", ["block of text"]),
         ("a.yaml", "map: |\n  111\nsize: 3", ['"size"', "map, cell, block"]),
         ("a.yaml", "map: |\n  111\ncell: big", ["'big'", "1.5 to 100"]),

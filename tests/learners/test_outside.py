@@ -90,6 +90,38 @@ def test_what_is_wrong_with_it_is_said_in_one_line_and_nothing_is_written(here, 
     assert line in error and error.count("\n") == 1 and not (here / "run").exists()
 
 
+STEP = "State(state.weights - config.learning_rate * step, optimizer)"
+MISTAKES = {
+    "settings of no learner": ("Config(LearnerConfig)", "Config", "a subclass of star.learners.LearnerConfig"),
+    "no example": (", *, example)", ")", "learner mine:reinforce: init raises TypeError: init() got an unexpected"),
+    "an error": ("    def to_go", "    1 / 0\n    def to_go", "update raises ZeroDivisionError: division by zero ("),
+    "a state alone": (STEP + ', {"loss": value}', STEP, "update gives a State; allowed: state, {metric: number}"),
+    "another shape": (
+        STEP,
+        STEP.replace("state.weights - config.learning_rate * step", "state.weights[:1]"),
+        "update makes",
+    ),
+    "a metric that is none": (
+        '{"loss": value}',
+        '{"loss": step}',
+        "update's metric loss is float32 [6, 2]; allowed: one",
+    ),
+    "an action too long": ("action.size))", "action.size + 1))", "act gives float32 [1, 3] for observations [1, 6]"),
+    "an exit": ("import optax", "raise SystemExit", "cannot be imported: SystemExit:  ("),
+}
+
+
+@pytest.mark.parametrize("case", MISTAKES)
+def test_a_mistake_in_its_functions_is_one_line_before_anything_is_written(here, capsys, case):
+    right, wrong, line = MISTAKES[case]
+    text = (here / "mine.py").read_text()
+    assert text.count(right) == 1
+    (here / "mine.py").write_text(text.replace(right, wrong))
+    assert main(["train", "run.yaml", *LEARNER, "--run-dir", "run", "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert line in error and error.count("\n") == 1 and not (here / "run").exists(), error
+
+
 def test_a_module_that_breaks_is_one_line_too(here, capsys):
     (here / "mine.py").write_text("raise OSError('no\\nsuch luck')")
     assert main(["train", "run.yaml", *LEARNER, "--run-dir", "run"]) == 2

@@ -136,7 +136,7 @@ def test_every_float_of_the_agent_may_differ_side_by_side_and_nothing_else():
 
 def test_a_grid_tries_every_point_once_and_writes_down_which_is_best(folder, capsys, monkeypatch):
     monkeypatch.setattr(working.work, "__kwdefaults__", working.work.__kwdefaults__ | {"make": Stub})
-    parameters = {"controller.ppo.learning_rate": ["1e-4", 1e-3], "tutor.ppo.hidden": [[8], [4, 4]]}
+    parameters = {"controller.ppo.learning_rate": [1e-4, 1e-3], "tutor.ppo.hidden": [[8], [4, 4]]}
     path = written(parameters=parameters)
     assert cli.main(["sweep", str(path), "--out", "out"]) == 0
     with open("out/trials.csv", newline="") as file:

@@ -279,6 +279,56 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_written(here, capsys, 
     assert line in said and not Path("run").exists()
 
 
+MISTAKES = {
+    "no steps": (
+        "return self.config.learning.pulls",
+        "return 0",
+        "steps_per_epoch is 0; allowed: a whole number above 0",
+    ),
+    "half a step": ("return self.config.learning.pulls", "return 2.5", "steps_per_epoch is 2.5"),
+    "no steps to be had": (
+        "return self.config.learning.pulls",
+        "return 1 / 0",
+        "steps_per_epoch raises ZeroDivisionErr",
+    ),
+    "one seed alone": (
+        "@over_seeds\n    def init",
+        "def init",
+        "init makes values float32 [3]; allowed: an axis of seeds",
+    ),
+    "epochs that are no numbers": (
+        "jnp.zeros((), jnp.int32)",
+        "jnp.zeros(())",
+        "init makes epoch float32 [1]; allowed",
+    ),
+    "an error": ("key, *keys =", "raise OSError('x')\n        key, *keys =", "epoch raises OSError: x ("),
+    "a state alone": (', {"bandit/error": errors.mean()}', "", "epoch gives a State; allowed: state, {metric: number}"),
+    "another shape": ("State(values=values,", "State(values=values[:2],", "epoch makes values float32 [5, 2]; allowed"),
+    "a metric of many": ("errors.mean()", "errors", "epoch's bandit/error is float32 [5, 20]; allowed: a number for"),
+    "an error at the end": ("return {", "raise OSError('x')\n        return {", "evaluate raises OSError: x ("),
+}
+LATER = {  # what only a first epoch and its evaluation can tell
+    "epochs that stay": ("epoch=state.epoch + 1", "epoch=state.epoch", "`epoch` is 0 after epoch 1; it must add 1"),
+    "no rows": ("return [{", "return\n        return [{", "rows gives null; allowed: a list with a mapping for each"),
+    "rows of one": ('(len(evaluated["pay"]))', "(1)", "rows gives [{"),
+    "no such measure": ('Measure("pay")', 'Measure("pai")', "rows lacks pai, a measure of its Kind; it has "),
+    "text": ("float(x[i])", "str(x[i])", "rows gives distance '"),
+    "an error": ("return [{", "return 1 / 0\n        return [{", "rows raises ZeroDivisionError: division by zero ("),
+}
+
+
+@pytest.mark.parametrize("case", [*MISTAKES, *(f"later: {case}" for case in LATER)])
+def test_a_mistake_in_its_functions_is_said_in_one_line(here, capsys, case):
+    later = case.removeprefix("later: ")
+    right, wrong, line = MISTAKES[case] if later == case else LATER[later]
+    text = (here / "bandit.py").read_text()
+    assert right in text
+    (here / "bandit.py").write_text(text.replace(right, wrong, 1))
+    assert main(["train", "run.yaml", "--run-dir", "run", "--quiet"]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert f"experiment: bandit:KIND: {line}" in said and Path("run").exists() == (later != case), said
+
+
 def test_a_run_is_of_one_experiment(here, capsys):
     trained("run")
     capsys.readouterr()
