@@ -91,9 +91,10 @@ def _check_type(value: Any, annotation: Any) -> None:
 def _is_number(value: Any) -> bool:
     """True if Python makes a number of it."""
     try:
-        return bool(float(value)) or True
+        float(value)
     except ValueError:
         return False
+    return True
 
 
 _NAMES = {bool: "bool", int: "int", float: "float", str: "string"}
