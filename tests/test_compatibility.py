@@ -195,7 +195,7 @@ def test_goal_selection_alone_refuses_the_modes_that_environments_refuse(mode):
 def test_printed_commands_can_be_typed(tmp_path, capsys):
     assert command_line.of("evaluate", Path("runs/a b")) == "star evaluate 'runs/a b'"
     (tmp_path / "a b").mkdir()
-    (tmp_path / "a b" / "x").touch()
+    (tmp_path / "a b" / "config.yaml").touch()
     command = ["train", str(ROOT / "configs/point_maze.yaml"), "--run-dir", str(tmp_path / "a b")]
     assert cli.main(command) == 2
     assert f"star train --resume '{tmp_path}/a b'" in capsys.readouterr().err

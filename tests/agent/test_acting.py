@@ -243,10 +243,10 @@ def test_no_run_is_told_in_one_line(tmp_path):
 
 
 @pytest.mark.parametrize("function", [star.load, star.evaluate])
-@pytest.mark.parametrize("run", [5, None, ["runs"], b"runs"])
-def test_what_names_no_run_is_told_in_one_line(function, run):
+@pytest.mark.parametrize("given", [5, None, ["runs"], b"runs"])
+def test_what_names_no_run_is_told_in_one_line(function, given):
     with pytest.raises(UserError, match=r"^run: .* is not allowed: should be the folder of a run, or the name of an"):
-        function(run)
+        function(given)
 
 
 @pytest.mark.parametrize(
