@@ -14,6 +14,7 @@ from star.config.loading import load as load_config
 from star.config.run import RunConfig
 
 _SETTINGS = "settings"  # what errors call those that were passed
+_DOTTED = "a mapping of dotted keys"
 
 
 def train(
@@ -81,6 +82,7 @@ def evaluate(
     if checkpoint == "all":
         raise UserError("checkpoint: 'all' is not allowed: should be last, best or env steps")
     run_dir = agents.find(_path(run))
+    _check_keys(settings or {}, _SETTINGS, allowed=_DOTTED)
     measure = kind_of(run_dir).commands.get("measure", _measure)
     (row,) = measure(run_dir, settings or {}, checkpoint=str(checkpoint), seed=seed)
     return row
@@ -107,17 +109,21 @@ def load(run: str | Path, *, checkpoint: str | int = "last", seed: int | None = 
 
 def _config(config: Any, settings: Mapping[str, Any], layers: Sequence[str | Path]) -> RunConfig:
     """The validated settings of a run."""
-    for what, given in (("config", config), ("settings", settings)):
-        named = isinstance(given, Mapping) and all(isinstance(key, str) for key in given)
-        if not (named or (what == "config" and isinstance(given, str | Path | RunConfig))):
-            words = "a name, a file, or a mapping of sections" if what == "config" else "a mapping of dotted keys"
-            raise UserError(f"{what}: {shown(given)} is not allowed: should be {words}")
+    if not isinstance(config, str | Path | RunConfig):
+        _check_keys(config, "config", allowed="a name, a file, or a mapping of sections")
+    _check_keys(settings, _SETTINGS, allowed=_DOTTED)
     if isinstance(config, str | Path):
         return load_config(config, settings, layers=layers, typed=_SETTINGS)
     if layers:
         raise UserError("layers: need a config that is a name or a file")
     values = config.model_dump(mode="json") if isinstance(config, RunConfig) else config
     return parse(values, settings, typed=_SETTINGS)
+
+
+def _check_keys(given: Any, name: str, *, allowed: str) -> None:
+    """Raise `UserError` for what is no mapping whose keys are text."""
+    if not (isinstance(given, Mapping) and all(isinstance(key, str) for key in given)):
+        raise UserError(f"{name}: {shown(given)} is not allowed: should be {allowed}")
 
 
 def _path(run: Any) -> Path:

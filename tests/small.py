@@ -53,6 +53,13 @@ def assert_the_same(run, other, env_steps):
     return expected.keys()
 
 
+def change(file, right, wrong):
+    """Put `wrong` in the place of `right`, which the text of a file holds once."""
+    text = file.read_text()
+    assert text.count(right) == 1
+    file.write_text(text.replace(right, wrong))
+
+
 def unpacked(name, folder):
     """The run in `tests/data/<name>.zip`, in a new folder below `folder`."""
     shutil.unpack_archive(Path(__file__).parent / "data" / f"{name}.zip", folder / name)

@@ -19,6 +19,7 @@ class ConfigError(UserError):
 
 _LARGEST = 3.4e38  # of float32, in round numbers
 _SMALLEST = 1.2e-38
+_ERRORS: dict[type, Any] = {bool: "bool_type", int: "int_type", float: "float_type", str: "string_type"}  # pydantic's
 
 
 class Group(BaseModel):
@@ -74,7 +75,7 @@ def _check_type(value: Any, annotation: Any) -> None:
         for one in value:
             _check_type(one, parts[0])
     elif get_origin(annotation) is tuple and get_origin(parts[0]) is Literal:
-        raise ValueError(f"should be a list of {' or '.join(map(repr, get_args(parts[0])))}")
+        raise ValueError(f"should be a list of {_either(get_args(parts[0]))}")
     allowed = _scalars(annotation)
     if type(value) not in (bool, int, float, str) or not allowed or type(value) in allowed:
         return
@@ -82,10 +83,14 @@ def _check_type(value: Any, annotation: Any) -> None:
         return  # pydantic says it better
     literal = next((one for one in (annotation, *parts) if get_origin(one) is Literal), None)
     if literal is not None:
-        *first, last = map(repr, get_args(literal))
-        raise PydanticKnownError("literal_error", {"expected": " or ".join(filter(None, [", ".join(first), last]))})
-    kind = next(one for one in ("bool", "int", "float", "string") if one in {_NAMES[each] for each in allowed})
-    raise PydanticKnownError(f"{kind}_type")  # type: ignore[arg-type]
+        raise PydanticKnownError("literal_error", {"expected": _either(get_args(literal))})
+    raise PydanticKnownError(next(error for kind, error in _ERRORS.items() if kind in allowed))
+
+
+def _either(choices: Iterable[Any]) -> str:
+    """The choices as pydantic lists them, `'a', 'b' or 'c'`."""
+    *first, last = map(repr, choices)
+    return " or ".join(filter(None, [", ".join(first), last]))
 
 
 def _is_number(value: Any) -> bool:
@@ -97,9 +102,6 @@ def _is_number(value: Any) -> bool:
     return True
 
 
-_NAMES = {bool: "bool", int: "int", float: "float", str: "string"}
-
-
 def _scalars(annotation: Any) -> set[type]:
     """The types of numbers, text and booleans that an annotation allows; none if it may be anything else than null."""
     if get_origin(annotation) is Annotated:
@@ -109,7 +111,7 @@ def _scalars(annotation: Any) -> set[type]:
     if get_origin(annotation) in (Union, types.UnionType):
         found = [_scalars(one) for one in get_args(annotation) if one is not type(None)]
         return set().union(*found) if all(found) else set()
-    return {annotation} if annotation in _NAMES else set()
+    return {annotation} if annotation in _ERRORS else set()
 
 
 def _is_leaf_field(cls: type[Section], name: str) -> bool:

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array
 
 from envs.common import plugins, trees
@@ -43,7 +44,7 @@ def _update(own: Any, name: str, config: Any, state: Any, rollout: Any, **more: 
     if wrong is not None:
         raise UserError(f"learner {name}: update {wrong}")
     for metric, value in found[1].items():
-        if jax.numpy.shape(value) != ():
+        if jnp.shape(value) != ():
             raise UserError(
                 f"learner {name}: update's metric {metric} is {trees.described(value)}; allowed: one number"
             )

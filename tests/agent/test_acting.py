@@ -264,6 +264,9 @@ def test_settings_that_are_none_are_told_in_one_line(tmp_path, monkeypatch, conf
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=f"^{re.escape(line)}"):
         star.train(config, settings)
+    if settings:
+        with pytest.raises(UserError, match=f"^{re.escape(line)}"):
+            star.evaluate("point_maze", settings)
     assert not list(tmp_path.iterdir())
 
 

@@ -13,7 +13,7 @@ from envs.common import plugins
 from envs.common.errors import UserError
 from star.cli import main
 from star.config import loading
-from tests.small import ALONE, EPOCH, RUN, arrays
+from tests.small import ALONE, EPOCH, RUN, arrays, change
 
 PAGE = Path(__file__).parents[2] / "docs" / "howto.md"
 LEARNER = ["--controller.learner", "mine:reinforce"]
@@ -99,7 +99,7 @@ MISTAKES = {
     "another shape": (
         STEP,
         STEP.replace("state.weights - config.learning_rate * step", "state.weights[:1]"),
-        "update makes",
+        "update makes weights float32 [1, 2]; allowed: float32 [6, 2], as in init",
     ),
     "a metric that is none": (
         '{"loss": value}',
@@ -113,10 +113,8 @@ MISTAKES = {
 
 @pytest.mark.parametrize("case", MISTAKES)
 def test_a_mistake_in_its_functions_is_one_line_before_anything_is_written(here, capsys, case):
-    right, wrong, line = MISTAKES[case]
-    text = (here / "mine.py").read_text()
-    assert text.count(right) == 1
-    (here / "mine.py").write_text(text.replace(right, wrong))
+    *mistake, line = MISTAKES[case]
+    change(here / "mine.py", *mistake)
     assert main(["train", "run.yaml", *LEARNER, "--run-dir", "run", "--quiet"]) == 2
     error = capsys.readouterr().err
     assert line in error and error.count("\n") == 1 and not (here / "run").exists(), error

@@ -25,7 +25,7 @@ from star.sweeps import work as working
 from star.training.checkpoint import Checkpoints
 from star.training.journal import JsonLines
 from star.training.program import Program, select_device
-from tests.small import arrays
+from tests.small import arrays, change
 
 PAGE = Path(__file__).parents[2] / "docs" / "experiments.md"
 # The same with a measure where less is better, and seeds that share a counter.
@@ -320,10 +320,8 @@ LATER = {  # what only a first epoch and its evaluation can tell
 @pytest.mark.parametrize("case", [*MISTAKES, *(f"later: {case}" for case in LATER)])
 def test_a_mistake_in_its_functions_is_said_in_one_line(here, capsys, case):
     later = case.removeprefix("later: ")
-    right, wrong, line = MISTAKES[case] if later == case else LATER[later]
-    text = (here / "bandit.py").read_text()
-    assert right in text
-    (here / "bandit.py").write_text(text.replace(right, wrong, 1))
+    *mistake, line = MISTAKES[case] if later == case else LATER[later]
+    change(here / "bandit.py", *mistake)
     assert main(["train", "run.yaml", "--run-dir", "run", "--quiet"]) == 2
     (said,) = capsys.readouterr().err.splitlines()
     assert f"experiment: bandit:KIND: {line}" in said and Path("run").exists() == (later != case), said
