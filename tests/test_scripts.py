@@ -191,8 +191,9 @@ def test_the_benchmark_of_an_epoch_calls_its_parts_as_they_are(run, monkeypatch)
 
     monkeypatch.setattr(programs, "build", without_epoch)
     row = script.benchmark(run / "config.yaml", 1, {})
-    assert row["physics_env_steps_per_s"] == 200 * 4 * 2 / 0.5 and len(timed) == 3
+    assert row["physics_env_steps_per_s"] == 200 * 4 * 2 / 0.5 and len(timed) == 4
     assert row["refinement_share"] == row["forward_model_share"] == 0.5 / row["epoch_s"]
+    assert row["planning_share"] == 2 * 0.5 / row["epoch_s"]  # of two periods an episode
 
 
 def report(name, finals, *, to_level):

@@ -3,7 +3,8 @@
     python scripts/benchmarks/epoch.py configs/ant_maze.yaml [--epochs 3] [--section.key VALUE ...]
 
 Prints one JSON object. Speeds are env steps/s of all environments and seeds. `refinement_share` is the time that the
-refinement alone takes over that of the epoch that contains it; `forward_model_share` likewise for its training.
+refinement alone takes over that of the epoch that contains it; `forward_model_share` likewise for its training, and
+`planning_share` for the Commander's plans, of which there is one a period.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ import jax.numpy as jnp
 import envs
 from star.abstraction import forward_model as models
 from star.abstraction import refinement
+from star.agent import levels
+from star.agent.decisions import Roadmap
 from star.agent.state import TrainState
 from star.cli.words import split_settings
 from star.config.loading import load
@@ -66,6 +69,10 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
         return refinement.refine(agent, *tables, goals, cube=program.experiment.spec.cube, key=key)
 
     train = jax.jit(jax.vmap(lambda s, f, k: models.train(agent.forward_model, s, f, key=k)))
+    commander = levels.of(agent, program.experiment.spec).commander
+    roadmaps = jax.jit(jax.vmap(lambda s: Roadmap.of(agent.commander, s.abstraction, s.graph)))(state)
+    plan = jax.jit(jax.vmap(lambda s, r: commander.plan(agent.commander, s.commander, r)))
+    periods = program.experiment.spec.episode_length // agent.commander.period
     return {
         "task": config.env.name,
         "engine": config.env.engine,
@@ -79,6 +86,7 @@ def benchmark(path: Path, epochs: int, overrides: dict[str, Any]) -> dict[str, A
         "physics_env_steps_per_s": _physics_speed(program, len(program.seeds)),
         "refinement_share": _seconds(refine, state, fresh, keys) / epoch_s,
         "forward_model_share": _seconds(train, state.forward_model, fresh, keys) / epoch_s,
+        "planning_share": _seconds(plan, state, roadmaps) * periods / epoch_s,
     }
 
 

@@ -244,13 +244,14 @@ def observe(
     due: Bool[Array, ""],
     margin: Float[Array, ""] | float = 0.0,
 ) -> CommanderState:
-    """Take in what the streams decided at one instant, and where it is `due`, plan by it.
+    """Take in what the streams decided at one instant, and where it is `due`, plan by it for their goals.
 
     Q-learning also raises what a teacher chose towards `margin` above all else.
     """
     rule = _rule(section)
     state = state.replace(chosen=state.chosen.at[batch.target].add(batch.weight))
-    return rule.plan(section, rule.observe(section, state, roadmap, batch, margin=margin), roadmap, due=due)
+    state = rule.observe(section, state, roadmap, batch, margin=margin)
+    return rule.plan(section, state, roadmap, goals=batch.goal_region, due=due)
 
 
 def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, episode_length: int) -> CommanderState:

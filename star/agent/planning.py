@@ -32,6 +32,7 @@ from star.agent.sections import CommanderConfig
 from star.agent.values import CommanderState, Model
 
 _HUNCH = 0.1  # what belief is worth where nothing is to be tried
+_TOGETHER = 32  # goal regions whose values are iterated at once
 _KEPT = 20.0  # decisions of a command that do not fade, since rare ones would be forgotten before they are enough
 
 
@@ -50,21 +51,40 @@ def observe(
 
 
 def plan(
-    section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, due: Bool[Array, ""] | None = None
+    section: CommanderConfig,
+    state: CommanderState,
+    roadmap: Roadmap,
+    *,
+    goals: Int[Array, "N"] | None = None,
+    due: Bool[Array, ""] | None = None,
 ) -> CommanderState:
-    """Values by what is known now, where it is `due` (None: now)."""
-    now = partial(_plan, section, roadmap, state)
+    """Values by what is known now, where it is `due` (None: now), for goals in the regions `goals` (None: in all)."""
+    now = partial(_plan, section, roadmap, state, goals)
     return state.replace(q=now() if due is None else jax.lax.cond(due, now, lambda: state.q))
 
 
-def _plan(section: CommanderConfig, roadmap: Roadmap, state: CommanderState) -> Float[Array, "R R S"]:
+def _plan(
+    section: CommanderConfig, roadmap: Roadmap, state: CommanderState, goals: Int[Array, "N"] | None
+) -> Float[Array, "R R S"]:
     """Q by `section.sweeps` sweeps of value iteration on the model, from the values of last time.
 
     As long as nothing is known, region j is held reachable from i where `believed` [i, j], and who aims at a goal in
     his own region is taken to succeed (or, with rewards that are negative, to lose nothing anywhere).
     """
     chances, reward = _expectations(section, _model(state), roadmap, belief=1.0)
-    return _iterated(section, roadmap.allowed, state.q, reward, chances, sweeps=section.sweeps)
+    every = jnp.arange(len(state.q))
+    iterated = partial(_iterated, section, roadmap.allowed, chances, sweeps=section.sweeps)
+    if goals is None or len(every) <= _TOGETHER:
+        return iterated(state.q, reward, every)
+    wanted = jnp.zeros(len(every), bool).at[goals].set(True)
+    beyond = jnp.full(-len(every) % _TOGETHER, len(every))  # neither read nor written
+    parts = jnp.concatenate([jnp.argsort(~wanted, stable=True), beyond]).reshape(-1, _TOGETHER)
+
+    def one(number: Array, q: Array) -> Array:
+        some = parts[number]
+        return q.at[:, some].set(iterated(q[:, some], reward[:, some], some))
+
+    return jax.lax.fori_loop(0, -(-wanted.sum() // _TOGETHER), one, state.q)
 
 
 def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, periods: int) -> CommanderState:
@@ -77,8 +97,8 @@ def settle(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *,
     if section.reward != "success":
         return state
     chances, reward = _expectations(section, _model(state), roadmap, belief=_HUNCH)
-    nothing = jnp.zeros_like(state.q)
-    return state.replace(q=_iterated(section, roadmap.allowed, nothing, reward, chances, sweeps=periods))
+    nothing, every = jnp.zeros_like(state.q), jnp.arange(len(state.q))
+    return state.replace(q=_iterated(section, roadmap.allowed, chances, nothing, reward, every, sweeps=periods))
 
 
 def fade(section: CommanderConfig, state: CommanderState) -> Model:
@@ -202,22 +222,24 @@ def _weight_of_belief(section: CommanderConfig, number: Float[Array, "*n"]) -> F
 def _iterated(
     section: CommanderConfig,
     allowed: Successors,
-    q: Float[Array, "R R S"],
-    reward: Float[Array, "R R S"],
     chances: Float[Array, "2 R S S"],
+    q: Float[Array, "R G S"],
+    reward: Float[Array, "R G S"],
+    goals: Int[Array, "G"],
     *,
     sweeps: int,
-) -> Float[Array, "R R S"]:
-    """The values `q` after sweeps of value iteration."""
+) -> Float[Array, "R G S"]:
+    """The values `q` of the regions `goals` after sweeps of value iteration."""
     (to_region, to_goal), near = chances, allowed.near.region
     product = partial(jnp.einsum, precision=jax.lax.Precision.HIGHEST)
-    at_goal = near[:, None] == jnp.arange(len(near))[None, :, None]
+    at_goal = near[:, None] == goals[None, :, None]
+    column = jnp.zeros(len(near), jnp.int32).at[goals].set(jnp.arange(len(goals)))[near]
 
     def sweep(q: Array, _: None) -> tuple[Array, None]:
-        future = values.best(q, allowed)[near]
+        future = values.best(q, allowed, goals)[near]
         later = product("ijn,ing->igj", to_region, future)
-        goals = product("ijn,inj->ij", to_goal, jnp.take_along_axis(future, near[:, None], axis=2))
-        return reward + section.discount * jnp.where(at_goal, goals[:, None], later), None
+        there = product("ijn,inj->ij", to_goal, jnp.take_along_axis(future, column[:, None], axis=2))
+        return reward + section.discount * jnp.where(at_goal, there[:, None], later), None
 
     return jax.lax.scan(sweep, q, None, length=sweeps)[0]
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from star.abstraction.regions import Change
 from star.agent.decisions import Decision, Roadmap
@@ -40,9 +40,7 @@ def observe(
     return _step(section, state, cell, lacking, weight=batch.weight * batch.shown)
 
 
-def plan(
-    section: CommanderConfig, state: CommanderState, roadmap: Roadmap, *, due: Bool[Array, ""] | None = None
-) -> CommanderState:
+def plan(section: CommanderConfig, state: CommanderState, roadmap: Roadmap, **_: Any) -> CommanderState:
     """Nothing is planned: values come from decisions alone."""
     return state
 

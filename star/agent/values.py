@@ -92,11 +92,11 @@ def towards(
     return best(state.q, allowed)[:, goal_region], near.region[every, jnp.argmax(values, axis=-1)]
 
 
-def best(q: Float[Array, "R R S"], allowed: Successors) -> Float[Array, "R R"]:
-    """Value of every region and goal region by greedy choices; 0 for regions that are not in use."""
-    own, greedy = jnp.arange(q.shape[0]), allowed.greedy
-    values = jnp.where(greedy[:, None], q, -jnp.inf).max(axis=-1)
-    values = values.at[own, own].max(q[own, own, allowed.near.own])
+def best(q: Float[Array, "R G S"], allowed: Successors, goals: Int[Array, "G"] | None = None) -> Float[Array, "R G"]:
+    """Value of every region and goal region, all (None) or `goals`, by greedy choices; 0 for regions not in use."""
+    goals, greedy = jnp.arange(q.shape[0]) if goals is None else goals, allowed.greedy
+    values, own = jnp.where(greedy[:, None], q, -jnp.inf).max(axis=-1), (goals, jnp.arange(len(goals)))
+    values = values.at[own].max(q[*own, allowed.near.own[goals]])
     return jnp.where(greedy.any(axis=1)[:, None], values, 0.0)
 
 

@@ -108,6 +108,21 @@ def test_plans_are_those_of_a_commander_that_may_choose_the_same_targets(seed):
         np.testing.assert_allclose(found, table, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.parametrize("goals", [[3], [6, 0, 3], [5, 5, 1, 2, 4, 0]], ids=str)
+def test_plans_for_some_goals_are_those_for_all_and_other_goals_keep_theirs(monkeypatch, goals):
+    monkeypatch.setattr(planning, "_TOGETHER", 2)  # so that parts are full and not full, and none is the whole
+    rng = np.random.default_rng(0)
+    near, section = lists(rng), settings(nearest=S)
+    roadmap, _ = roadmaps(rng, near)
+    state = observe(section, commander.init(section, regions=R), roadmap, decisions(rng, near))
+    state = state.replace(q=rng.random((R, R, S)).astype(np.float32))
+    every = plan(section, state, roadmap).q
+    found = jax.jit(planning.plan)(section, state, roadmap, goals=jnp.asarray(goals)).q
+    np.testing.assert_allclose(found[:, goals], every[:, goals], rtol=1e-6)
+    changed = np.flatnonzero((np.asarray(found) != state.q).any(axis=(0, 2)))
+    assert set(goals) <= set(changed) and len(changed) <= len(set(goals)) + 1  # the last part is filled up
+
+
 def test_a_command_that_leads_further_is_not_counted():
     rng = np.random.default_rng(0)
     near = lists(rng)
